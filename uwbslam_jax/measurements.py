@@ -1,0 +1,149 @@
+"""What is measured: host messages (stamped in ns) and the fixed-shape arrays of one frame.
+
+Nothing here reads a file, knows a sensor's protocol or computes an estimate.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+NAN = float("nan")
+
+
+@dataclass(frozen=True, slots=True)
+class RangeMessage:
+    """One two-way ranging exchange between two nodes.
+
+    Attributes:
+      stamp: time of the exchange [ns, int64 epoch].
+      source, target: node ids (any uint32).
+      range: measured distance between the antennas [m].
+      receive_power, first_path_power: DW1000 powers [dBm], NaN where the radio does not say.
+    """
+
+    stamp: int
+    source: int
+    target: int
+    range: float
+    receive_power: float = NAN
+    first_path_power: float = NAN
+
+
+@dataclass(frozen=True, slots=True)
+class ScanMessage:
+    """One sweep of a 2D LiDAR, as in sensor_msgs/LaserScan.
+
+    Attributes:
+      stamp: time of the first beam [ns].
+      angle_min, angle_increment: bearing of beam i is angle_min + i * angle_increment [rad], counter-clockwise.
+      time_increment: time between two beams [s]; 0 where the whole sweep is taken at once.
+      range_min, range_max: limits of the sensor [m]; a reading outside, zero, inf or NaN is no return.
+      ranges: (beams,) float32 [m].
+    """
+
+    stamp: int
+    angle_min: float
+    angle_increment: float
+    time_increment: float
+    range_min: float
+    range_max: float
+    ranges: np.ndarray
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryMessage:
+    """A pose in the odometry's own drifting frame; only increments are used. [ns, m, m, rad]"""
+
+    stamp: int
+    x: float
+    y: float
+    yaw: float
+
+
+@dataclass(frozen=True, slots=True)
+class TruthMessage:
+    """Ground truth for evaluation only: the robot (node None) or one beacon. [ns, m, m, rad]
+
+    yaw is NaN for a beacon. The estimator never sees these.
+    """
+
+    stamp: int
+    node: int | None
+    x: float
+    y: float
+    yaw: float = NAN
+
+
+Message = RangeMessage | ScanMessage | OdometryMessage | TruthMessage
+
+
+class Scan(NamedTuple):
+    """One sweep, padded. B = config.max_beams.
+
+    Attributes:
+      ranges: distance of each beam [m], 0 where there is no return.
+      valid: True where the beam returned within limits.
+      angle_min, angle_increment: bearing of beam i [rad].
+      time_increment: time from beam to beam [s].
+    """
+
+    ranges: Float[Array, "B"]
+    valid: Bool[Array, "B"]
+    angle_min: Float[Array, ""]
+    angle_increment: Float[Array, ""]
+    time_increment: Float[Array, ""]
+
+
+class Ranges(NamedTuple):
+    """All exchanges of one frame, padded. M = config.max_ranges; slots index nodes, 0 is the robot.
+
+    Attributes:
+      i, j: slots of the two nodes.
+      range: measured distance [m].
+      age: time of the exchange relative to the frame's stamp [s], <= 0.
+      power_gap: receive minus first-path power [dB], NaN where unknown.
+      valid: True where there is a measurement.
+    """
+
+    i: Int[Array, "M"]
+    j: Int[Array, "M"]
+    range: Float[Array, "M"]
+    age: Float[Array, "M"]
+    power_gap: Float[Array, "M"]
+    valid: Bool[Array, "M"]
+
+
+class Odometry(NamedTuple):
+    """Motion since the last frame in the robot's frame at that time [m, m, rad]; valid False where there is none."""
+
+    increment: Float[Array, "3"]
+    valid: Bool[Array, ""]
+
+
+class Frame(NamedTuple):
+    """One padded set of measurements, all that a step sees.
+
+    Attributes:
+      dt: time since the frame before [s].
+      has_scan: False for a frame that carries ranges only.
+      scan, ranges, odometry: see there.
+    """
+
+    dt: Float[Array, ""]
+    has_scan: Bool[Array, ""]
+    scan: Scan
+    ranges: Ranges
+    odometry: Odometry
+
+
+@dataclass(frozen=True, slots=True)
+class StampedFrame:
+    """A frame with the time that float32 cannot hold [ns] and whether a scan was taken then."""
+
+    stamp: int
+    frame: Frame
+    slots: dict[int, int] = field(default_factory=dict)  # node id -> slot, as known at this frame

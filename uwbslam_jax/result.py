@@ -1,0 +1,71 @@
+"""What a run hands over when it ends: host data for files, report and evaluation. No computation, no files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+
+@dataclass(frozen=True, slots=True)
+class BeaconEstimate:
+    """Last estimate of one beacon ever placed, in the published frame.
+
+    Attributes:
+      id: the node's id.
+      position: (2,) [m].
+      cov: (2, 2) [m^2].
+      status: "static", "moving", "silent" or "dropped".
+    """
+
+    id: int
+    position: np.ndarray
+    cov: np.ndarray
+    status: str
+
+
+@dataclass(frozen=True, slots=True)
+class MapImage:
+    """Occupancy of the finest level in the published frame.
+
+    Attributes:
+      log_odds: (rows, cols) float32; row 0 is the smallest y; exactly 0 where never observed.
+      resolution: side of a cell [m].
+      origin: (2,) corner of cell (0, 0), the smallest x and y [m].
+    """
+
+    log_odds: np.ndarray
+    resolution: float
+    origin: np.ndarray
+
+
+@dataclass(slots=True)
+class Result:
+    """Everything a run found. T frames from the first scan on, all poses in the published frame.
+
+    Attributes:
+      stamps: (T,) int64 [ns].
+      poses: (T, 3) x, y, yaw [m, m, rad].
+      pose_covs: (T, 3, 3) [m, m, rad].
+      beacons: last estimate of every beacon ever placed.
+      beacon_tracks: id -> (n, 4) of t [s since stamps[0]], x, y, sigma [m], thinned; for plots.
+      map: the occupancy map.
+      range_residuals: (R, 4) of t [s since stamps[0]], node a, node b, measured minus predicted [m]; thinned.
+      scan_points: last scan in the published frame (n, 2) [m].
+      diagnostics: name -> (T,) array, one value a frame (match score, hypotheses, searches, ranges used ...).
+      events: (stamp ns, text) of start-up and beacon life.
+      summary: the content of summary.json (see DESIGN: steps, duration_s, ...), without evaluation figures.
+    """
+
+    stamps: np.ndarray
+    poses: np.ndarray
+    pose_covs: np.ndarray
+    beacons: list[BeaconEstimate]
+    beacon_tracks: dict[int, np.ndarray]
+    map: MapImage
+    range_residuals: np.ndarray
+    scan_points: np.ndarray
+    diagnostics: dict[str, np.ndarray] = field(default_factory=dict)
+    events: list[tuple[int, str]] = field(default_factory=list)
+    summary: dict[str, Any] = field(default_factory=dict)
