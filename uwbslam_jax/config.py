@@ -1,0 +1,138 @@
+"""Settings a user writes (TOML or flags) and the two things they become: static Config and tunable Params.
+
+Settings are plain host data, one dataclass a TOML section. Config is hashable and fixes sizes and switches, so
+it may be a static argument of a jitted function. Params are the differentiable leaves.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+
+class ConfigError(ValueError):
+    """A setting that is unknown, of the wrong type or out of range; the message is one line."""
+
+
+@dataclass(frozen=True)
+class RobotSettings:
+    """The robot: its UWB node id and where its sensors sit in the robot's frame."""
+
+    id: int = 0
+    """Node id of the robot's UWB radio."""
+    antenna: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """UWB antenna x, y, z on the robot [m]."""
+    lidar: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """LiDAR x, y [m] and yaw [rad] on the robot."""
+
+
+@dataclass(frozen=True)
+class UwbSettings:
+    """Ranging."""
+
+    topic: str = "/uwb/ranges"
+    """Topic of the ranges."""
+    sigma_n: float = 0.1
+    """Standard deviation of a range [m]."""
+    nlos_gap_db: float = 10.0
+    """A range whose receive power exceeds its first-path power by more than this [dB] is taken as NLOS and ignored."""
+    max_beacons: int = 8
+    """Slots for beacons; ids beyond are counted and ignored."""
+    max_range: float = 200.0
+    """Longer ranges are dropped and counted [m]."""
+    height: dict[str, float] = field(default_factory=dict)
+    """Height of a node's antenna above the floor by id [m]; where not given, that of the robot's antenna."""
+    bias: dict[str, float] = field(default_factory=dict)
+    """Range bias (antenna delay) of a node by id [m]; a pair's bias is the sum of both."""
+
+
+@dataclass(frozen=True)
+class LidarSettings:
+    """The laser scanner."""
+
+    topic: str = "/scan"
+    """Topic of the scans."""
+    min_range: float = 0.1
+    """Shorter readings are no return [m]; the sensor's own limit holds where it is narrower."""
+    max_range: float = 30.0
+    """Longer readings are no return [m]; the sensor's own limit holds where it is narrower."""
+    max_beams: int = 1081
+    """A scan of more beams is thinned evenly to at most this many."""
+
+
+@dataclass(frozen=True)
+class OdomSettings:
+    """Optional odometry: predicts the motion where a log has it."""
+
+    topic: str = "/odom"
+    """Topic of the odometry."""
+    use: bool = True
+    """Whether to use it."""
+    sigma_xy: float = 0.05
+    """Error of an increment per metre driven [m/m]."""
+    sigma_yaw: float = 0.05
+    """Error of an increment per radian turned [rad/rad]."""
+    sigma_floor: tuple[float, float] = (0.01, 0.01)
+    """Error of any increment [m, rad]."""
+
+
+@dataclass(frozen=True)
+class MapSettings:
+    """The occupancy map."""
+
+    resolution: float = 0.05
+    """Side of a cell of the finest level [m]."""
+    levels: int = 3
+    """Levels of the pyramid; each doubles the cell."""
+    size_m: float = 51.2
+    """Side of the window that is matched against [m]; the whole map is not bounded by it."""
+
+
+@dataclass(frozen=True)
+class FilterSettings:
+    """The estimator."""
+
+    preset: Literal["robust", "paper"] = "robust"
+    """robust: everything. paper: the paper as printed with its errata mended."""
+    scan_matching: bool = True
+    """Paper's case: without it the map is drawn at the UWB pose."""
+    correction: bool = True
+    """Paper's case: without it a match is not fed back into the state."""
+    lidar_only: bool = False
+    """Ignore all ranges: HectorSLAM's objective."""
+    gamma: float = 0.65
+    """Weight of a squared range residual against a squared LiDAR residual in the joint objective [1/m^2]; paper only."""
+    sigma_w: float = 1.0
+    """Acceleration noise of the robot [m/s^1.5]; in the paper preset the paper's sigma_w of every node [m/s]."""
+    sigma_w_yaw: float = 2.0
+    """Angular acceleration noise of the robot [rad/s^1.5]."""
+    sigma_w_beacon: float = 1e-4
+    """Random walk of a beacon at rest [m/s^0.5]."""
+    sigma_l: float = 0.25
+    """Standard deviation of one beam's residual 1 - Gamma."""
+    beam_share: float = 0.05
+    """Share of the beams that counts as independent in a match's information."""
+    sigma_map: float = 0.08
+    """Standard deviation of the map's own position error where it was drawn while exploring [m]."""
+    sigma_map_yaw: float = 0.01
+    """The same for its heading [rad]."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All settings; every key is optional."""
+
+    robot: RobotSettings = field(default_factory=RobotSettings)
+    uwb: UwbSettings = field(default_factory=UwbSettings)
+    lidar: LidarSettings = field(default_factory=LidarSettings)
+    odom: OdomSettings = field(default_factory=OdomSettings)
+    map: MapSettings = field(default_factory=MapSettings)
+    filter: FilterSettings = field(default_factory=FilterSettings)
