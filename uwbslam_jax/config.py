@@ -22,6 +22,65 @@ class ConfigError(ValueError):
     """A setting that is unknown, of the wrong type or out of range; the message is one line."""
 
 
+class Params(NamedTuple):
+    """The tunable leaves, all differentiable. K = 1 + max_beacons slots, slot 0 is the robot.
+
+    Attributes:
+      gamma, sigma_n, sigma_w, sigma_w_yaw, sigma_w_beacon, sigma_l, beam_share, sigma_map, sigma_map_yaw: see
+        FilterSettings and UwbSettings.
+      odom_sigma_xy, odom_sigma_yaw, odom_sigma_floor: see OdomSettings.
+      antenna: x, y of the UWB antenna on the robot [m].
+      lidar: pose of the LiDAR on the robot [m, m, rad].
+      bias: (K,) range bias of each node [m].
+      height: (K,) height of each node's antenna [m].
+    """
+
+    gamma: Float[Array, ""]
+    sigma_n: Float[Array, ""]
+    sigma_w: Float[Array, ""]
+    sigma_w_yaw: Float[Array, ""]
+    sigma_w_beacon: Float[Array, ""]
+    sigma_l: Float[Array, ""]
+    beam_share: Float[Array, ""]
+    sigma_map: Float[Array, ""]
+    sigma_map_yaw: Float[Array, ""]
+    odom_sigma_xy: Float[Array, ""]
+    odom_sigma_yaw: Float[Array, ""]
+    odom_sigma_floor: Float[Array, "2"]
+    antenna: Float[Array, "2"]
+    lidar: Float[Array, "3"]
+    bias: Float[Array, "K"]
+    height: Float[Array, "K"]
+
+
+@dataclass(frozen=True)
+class Config:
+    """Sizes and switches: what a compiled step depends on. Hashable.
+
+    Attributes:
+      nodes: slots K, robot included.
+      max_ranges: slots for the exchanges of one frame.
+      max_beams: slots for the beams of a scan.
+      resolution: cell of the finest level [m].
+      levels: of the pyramid.
+      cells: cells along the window's side at the finest level.
+      nlos_gap_db: power rule [dB].
+      preset, scan_matching, correction, lidar_only: see FilterSettings.
+    """
+
+    nodes: int
+    max_ranges: int
+    max_beams: int
+    resolution: float
+    levels: int
+    cells: int
+    nlos_gap_db: float
+    preset: Literal["robust", "paper"]
+    scan_matching: bool
+    correction: bool
+    lidar_only: bool
+
+
 @dataclass(frozen=True)
 class RobotSettings:
     """The robot: its UWB node id and where its sensors sit in the robot's frame."""
@@ -136,3 +195,44 @@ class Settings:
     odom: OdomSettings = field(default_factory=OdomSettings)
     map: MapSettings = field(default_factory=MapSettings)
     filter: FilterSettings = field(default_factory=FilterSettings)
+
+
+def make_config(settings: Settings) -> Config:
+    """The static part of the settings."""
+    nodes = 1 + settings.uwb.max_beacons
+    block = 64  # finest cells in a window stay divisible by every level and by the tiles kept outside it
+    cells = block * round(settings.map.size_m / settings.map.resolution / block)
+    return Config(
+        nodes=nodes,
+        max_ranges=max(32, nodes * (nodes - 1)),
+        max_beams=settings.lidar.max_beams,
+        resolution=settings.map.resolution,
+        levels=settings.map.levels,
+        cells=max(cells, block),
+        nlos_gap_db=settings.uwb.nlos_gap_db,
+        preset=settings.filter.preset,
+        scan_matching=settings.filter.scan_matching,
+        correction=settings.filter.correction,
+        lidar_only=settings.filter.lidar_only,
+    )
+
+
+def make_params(settings: Settings, slots: dict[int, int] | None = None) -> Params:
+    """The tunable part of the settings.
+
+    Args:
+      slots: node id -> slot, for the biases and heights that are given by id; ids without a slot are left out.
+    """
+    f, odom = settings.filter, settings.odom
+    k = 1 + settings.uwb.max_beacons
+    bias = np.zeros(k, np.float32)
+    height = np.full(k, settings.robot.antenna[2], np.float32)
+    for node, slot in {settings.robot.id: 0, **(slots or {})}.items():
+        bias[slot] = settings.uwb.bias.get(str(node), 0.0)
+        if slot > 0:
+            height[slot] = settings.uwb.height.get(str(node), settings.robot.antenna[2])
+    leaves: dict[str, Any] = {n: getattr(f, n) for n in ("gamma", "sigma_w", "sigma_w_yaw", "sigma_w_beacon", "sigma_l")}
+    leaves |= {n: getattr(f, n) for n in ("beam_share", "sigma_map", "sigma_map_yaw")}
+    leaves |= {f"odom_{n}": getattr(odom, n) for n in ("sigma_xy", "sigma_yaw", "sigma_floor")}
+    leaves |= {"sigma_n": settings.uwb.sigma_n, "antenna": settings.robot.antenna[:2], "lidar": settings.robot.lidar}
+    return Params(**{name: jnp.asarray(value, jnp.float32) for name, value in leaves.items()}, bias=jnp.asarray(bias), height=jnp.asarray(height))

@@ -1,0 +1,107 @@
+"""Process model: how the state moves between two frames, with or without odometry."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from uwbslam_jax import ekf, layout
+from uwbslam_jax.config import Params
+from uwbslam_jax.geometry import perpendicular, rotation
+from uwbslam_jax.layout import Nodes
+from uwbslam_jax.measurements import Odometry
+
+_COAST_S = 1.5
+"""A robot that is not seen keeps its velocity about this long; a longer gap adds no more motion."""
+
+
+def transition(
+    vector: Float[Array, "n"], dt: Float[Array, ""], odometry: Odometry, moving: Bool[Array, "K"]
+) -> Float[Array, "n"]:
+    """State after dt [s]: coordinated turn of the robot, or the odometry's increment; constant velocity of a node
+    that moves, none of one at rest. The map error is a rigid motion of the map, so it turns with the lever arm that
+    the robot drives."""
+    s = layout.unpack(vector)
+    coast = _COAST_S * (1.0 - jnp.exp(-dt / _COAST_S))
+    safe_dt = jnp.maximum(dt, 1e-3)
+    turn = s.yaw_rate * coast
+    coasted = rotation(turn / 2) @ s.velocities[0] * coast
+    driven = rotation(s.heading) @ odometry.increment[:2]
+    step = jnp.where(odometry.valid, driven, coasted)
+    velocity = jnp.where(odometry.valid, driven / safe_dt, rotation(turn) @ s.velocities[0] * jnp.exp(-dt / (4 * _COAST_S)))
+    yaw_step = jnp.where(odometry.valid, odometry.increment[2], turn)
+    yaw_rate = jnp.where(odometry.valid, odometry.increment[2] / safe_dt, s.yaw_rate * jnp.exp(-dt / (4 * _COAST_S)))
+    velocities = jnp.where(moving[:, None], s.velocities, 0.0).at[0].set(velocity)
+    steps = (velocities * coast).at[0].set(step)
+    map_step = s.map_error[2] * perpendicular(step)
+    return layout.pack(
+        Nodes(
+            positions=s.positions + steps,
+            velocities=velocities,
+            heading=s.heading + yaw_step,
+            yaw_rate=yaw_rate,
+            map_error=s.map_error.at[:2].add(map_step),
+        )
+    )
+
+
+def process_noise(
+    params: Params,
+    dt: Float[Array, ""],
+    odometry: Odometry,
+    moving: Bool[Array, "K"],
+) -> tuple[Float[Array, "n"], Float[Array, "n"]]:
+    """Diagonal of Q and its position-velocity (heading-rate) couplings, in the order of the state vector.
+
+    White acceleration (Bar-Shalom, Li, Kirubarajan, eq. 6.2.3-7) for what moves, a random walk for beacons at rest,
+    the error of the increment where there is odometry.
+    """
+    k = moving.shape[0]
+    t = jnp.minimum(dt, _COAST_S)
+    safe_dt = jnp.maximum(dt, 1e-3)
+    length = jnp.sqrt(odometry.increment[0] ** 2 + odometry.increment[1] ** 2 + 1e-12)
+    odo_xy = (params.odom_sigma_floor[0] + params.odom_sigma_xy * length) ** 2
+    odo_yaw = (params.odom_sigma_floor[1] + params.odom_sigma_yaw * jnp.abs(odometry.increment[2])) ** 2
+    w, w_yaw = params.sigma_w**2, params.sigma_w_yaw**2
+    robot = jnp.where(odometry.valid, jnp.stack([odo_xy, odo_xy / safe_dt, odo_xy / safe_dt**2]), w * jnp.stack([t**3 / 3, t**2 / 2, t]))
+    yaw = jnp.where(odometry.valid, jnp.stack([odo_yaw, odo_yaw / safe_dt, odo_yaw / safe_dt**2]), w_yaw * jnp.stack([t**3 / 3, t**2 / 2, t]))
+    carried = jnp.stack([t**3 / 3, t**2 / 2, t])
+    resting = jnp.stack([params.sigma_w_beacon**2 * dt, 0.0 * dt, 1e-10 + 0.0 * dt])
+    nodes = jnp.where(moving[:, None], carried, resting).at[0].set(robot)  # (K, 3): position, coupling, velocity
+    p, c, v = (jnp.repeat(nodes[:, m], 2) for m in range(3))
+    diagonal = jnp.concatenate([p, v, yaw[:1], yaw[2:], jnp.zeros(3)])
+    coupling = jnp.concatenate([c, jnp.zeros(2 * k), yaw[1:2], jnp.zeros(4)])
+    return diagonal, coupling
+
+
+def predict(
+    belief: ekf.Gaussian,
+    params: Params,
+    dt: Float[Array, ""],
+    odometry: Odometry,
+    moving: Bool[Array, "K"],
+    novelty: Float[Array, ""],
+) -> ekf.Gaussian:
+    """Belief dt [s] later.
+
+    Args:
+      moving: (K,) which nodes are carried; the robot's entry is ignored.
+      novelty: share of the robot's view that was drawn newly since the last frame. What is matched next is that much
+        a different map: the map error forgets by it and falls back to its stationary spread (Gauss-Markov).
+    """
+    k = moving.shape[0]
+    mean = transition(belief.mean, dt, odometry, moving)
+    F = jax.jacfwd(transition)(belief.mean, dt, odometry, moving)
+    diagonal, coupling = process_noise(params, dt, odometry, moving)
+    keep = 1.0 - novelty
+    rows = jnp.array(layout.map_error_indices(k))
+    spread = jnp.stack([params.sigma_map, params.sigma_map, params.sigma_map_yaw]) ** 2
+    mean = mean.at[rows].multiply(keep)
+    F = F.at[rows].multiply(keep)
+    diagonal = diagonal.at[rows].add((1.0 - keep**2) * spread + 1e-12)
+    Q = jnp.diag(diagonal)
+    at = jnp.concatenate([jnp.arange(2 * k), jnp.array([4 * k])])
+    to = jnp.concatenate([jnp.arange(2 * k, 4 * k), jnp.array([4 * k + 1])])
+    Q = Q.at[at, to].add(coupling[at]).at[to, at].add(coupling[at])
+    return ekf.predict(belief, mean, F, Q)
