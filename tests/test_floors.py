@@ -1,0 +1,65 @@
+"""A module imports only from lower floors, so that there is no circle and the picture of the package stays simple."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "uwbslam_jax"
+
+# Worlds lie below simulate, which draws from them.
+FLOORS: dict[int, str] = {
+    0: "__init__",
+    1: "geometry measurements config ekf result layout mcap_records schemas",
+    2: "motion ranging grid metrics frames mcap_log",
+    3: "objective",
+    4: "matching",
+    5: "slam",
+    6: "startup beacons paths",
+    7: "online batch worlds",
+    8: "tuning simulate report outputs",
+    9: "__main__",
+}
+FLOOR = {module: floor for floor, modules in FLOORS.items() for module in modules.split()}
+MODULES = sorted(PACKAGE.rglob("*.py"))
+
+
+def imported_modules(source: str) -> set[str]:
+    """Names of the package's own modules that a source imports, wherever the import stands in it."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = "uwbslam_jax" + (f".{node.module}" if node.module else "") if node.level else node.module or ""
+            names = [f"{base}.{alias.name}" for alias in node.names] if base == "uwbslam_jax" else [base]
+        else:
+            continue
+        found |= {name.split(".")[1] for name in names if name.startswith("uwbslam_jax.")}
+    return {name for name in found if (PACKAGE / f"{name}.py").exists() or name in FLOOR}
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: path.stem)
+def test_imports_only_from_lower_floors(path: Path) -> None:
+    assert path.stem in FLOOR, f"{path.name} is in no floor: add it to the table at the top of this file"
+    imported = imported_modules(path.read_text(encoding="utf-8"))
+    unlisted = sorted(imported - FLOOR.keys())
+    assert not unlisted, f"{path.name} imports {unlisted}, which are in no floor"
+    wrong = sorted(name for name in imported if FLOOR[name] >= FLOOR[path.stem])
+    assert not wrong, f"{path.name} imports {wrong} from its own floor or above"
+
+
+def test_imports_are_found_wherever_they_stand() -> None:
+    source = """
+import uwbslam_jax.grid
+from uwbslam_jax import slam, __version__
+from . import matching
+from .ekf import Gaussian
+if TYPE_CHECKING:
+    from uwbslam_jax.result import Result
+def late():
+    from uwbslam_jax.online import run
+"""
+    assert imported_modules(source) == {"grid", "slam", "matching", "ekf", "result", "online"}
