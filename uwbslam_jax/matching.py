@@ -1,0 +1,137 @@
+"""Aligning a scan with the map: Gauss-Newton coarse to fine, the score of a match, and the wide search."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import optimistix as optx
+from jaxtyping import Array, Bool, Float
+
+from uwbslam_jax import grid as occupancy
+from uwbslam_jax.ekf import Gaussian, symmetric_root
+from uwbslam_jax.geometry import transform_points, wrap_angle
+from uwbslam_jax.grid import Grid, Sweep
+from uwbslam_jax.objective import lidar_gram, lidar_residual, prior_residual
+
+_MOVES = (6, 5, 5)
+"""Gauss-Newton moves at the finest, middle and every coarser level."""
+_SEARCH_HEADINGS = 120
+_SEARCH_BEAMS = 180
+_SEARCH_REFINED = 8
+
+
+class Match(NamedTuple):
+    """A scan aligned with the map.
+
+    Attributes:
+      pose: (3,) the robot's pose in the map [m, m, rad].
+      information: (3, 3) Gram matrix of the residuals at that pose, unscaled (H^(LiD) of the paper).
+      score: mean Gamma of the returns that fall on observed cells; about 0.8 when right, 0.4 when not.
+      known: share of the returns that fall on observed cells.
+    """
+
+    pose: Float[Array, "3"]
+    information: Float[Array, "3 3"]
+    score: Float[Array, ""]
+    known: Float[Array, ""]
+
+
+class _LidarAndPrior(NamedTuple):
+    """What the residual of a match needs, at one level."""
+
+    level: Float[Array, "c c"]
+    origin: Float[Array, "2"]
+    size: Float[Array, ""]
+    points: Float[Array, "B 2"]
+    valid: Bool[Array, "B"]
+    mean: Float[Array, "3"]
+    root: Float[Array, "3 3"]
+    sigma_l: Float[Array, ""]
+
+
+def _residual(pose: Float[Array, "3"], a: _LidarAndPrior) -> Float[Array, "7"]:
+    lidar = lidar_residual(pose, a.level, a.origin, a.size, a.points, a.valid) / a.sigma_l
+    return jnp.concatenate([lidar, prior_residual(pose, a.mean, a.root)])
+
+
+def gauss_newton(residual, start, args, moves: int):
+    """Least squares by `moves` Gauss-Newton moves of optimistix; never raises, returns the last iterate."""
+    solver = optx.GaussNewton(rtol=1e-3, atol=1e-4, linear_solver=lx.Normal(lx.Cholesky()))
+    solution = optx.least_squares(
+        residual, solver, start, args=args, max_steps=moves + 1, throw=False, adjoint=optx.RecursiveCheckpointAdjoint()
+    )
+    return solution.value
+
+
+def align(
+    grid: Grid, sweep: Sweep, start: Float[Array, "3"], prior: Gaussian, sigma_l: Float[Array, ""], resolution: float
+) -> Float[Array, "3"]:
+    """Pose that minimises 1/2 sum (1 - Gamma)^2 / sigma_l^2 + the prior's quadratic, coarse to fine (DESIGN 1.4)."""
+    root = jnp.linalg.inv(symmetric_root(prior.cov))
+    pose = start
+    for k in reversed(range(len(grid.levels))):
+        size = jnp.asarray(resolution * 2**k, pose.dtype)
+        args = _LidarAndPrior(grid.levels[k], grid.origin, size, sweep.points, sweep.valid, prior.mean, root, sigma_l)
+        pose = gauss_newton(_residual, pose, args, _MOVES[min(k, 2)])
+    return pose
+
+
+def assess(grid: Grid, sweep: Sweep, pose: Float[Array, "3"], resolution: float) -> Match:
+    """Score and information of a pose against the finest level."""
+    level, origin = grid.levels[0], grid.origin
+    gram = lidar_gram(pose, level, origin, resolution, sweep.points, sweep.valid)
+    ends = transform_points(pose, sweep.points)
+    corners, at, inside = occupancy.corner_log_odds(level, origin, resolution, ends)
+    value, _ = occupancy.interpolate(jax.nn.sigmoid(corners), at, resolution)
+    observed = sweep.valid & inside & jnp.any(corners != 0, axis=(1, 2))
+    count = jnp.sum(observed)
+    score = jnp.sum(jnp.where(observed, value, 0.0)) / jnp.maximum(count, 1)
+    return Match(pose, gram[:3, :3], score, count / jnp.maximum(jnp.sum(sweep.valid), 1))
+
+
+def search(
+    grid: Grid,
+    sweep: Sweep,
+    prior: Gaussian,
+    sigma_l: Float[Array, ""],
+    resolution: float,
+) -> Float[Array, "3"]:
+    """Best pose over the full circle of headings and a patch of positions around the prior's mean (DESIGN 1.8).
+
+    Every heading and position is scored at the middle level; the best few are aligned and scored at the finest.
+    """
+    k = min(1, len(grid.levels) - 1)
+    size = resolution * 2**k
+    stride = max(1, sweep.points.shape[0] // _SEARCH_BEAMS)
+    points, valid = sweep.points[::stride], sweep.valid[::stride]
+    spread = jnp.clip(1.5 * jnp.sqrt(jnp.maximum(prior.cov[0, 0], prior.cov[1, 1])), 0.05, 0.6)
+    axis = jnp.linspace(-1.0, 1.0, 5)
+    offsets = jnp.stack(jnp.meshgrid(axis, axis), axis=-1).reshape(-1, 2) * spread
+    headings = prior.mean[2] + jnp.linspace(-jnp.pi, jnp.pi, _SEARCH_HEADINGS, endpoint=False)
+
+    def scores(heading):
+        c, s = jnp.cos(heading), jnp.sin(heading)
+        turned = jnp.stack([c * points[:, 0] - s * points[:, 1], s * points[:, 0] + c * points[:, 1]], axis=-1)
+        ends = (turned[None] + prior.mean[:2] + offsets[:, None]).reshape(-1, 2)
+        corners, at, inside = occupancy.corner_log_odds(grid.levels[k], grid.origin, size, ends)
+        value, _ = occupancy.interpolate(jax.nn.sigmoid(corners), at, size)
+        gain = jnp.where(inside, value - 0.5, 0.0).reshape(offsets.shape[0], -1)
+        return jnp.sum(jnp.where(valid, gain, 0.0), axis=1)
+
+    table = jax.lax.map(scores, headings, batch_size=8)  # (headings, offsets)
+    best_offset = jnp.argmax(table, axis=1)
+    _, best = jax.lax.top_k(jnp.max(table, axis=1), _SEARCH_REFINED)
+    starts = jnp.concatenate([prior.mean[:2] + offsets[best_offset[best]], headings[best, None]], axis=1)
+
+    def refine(start):
+        wide = Gaussian(start, prior.cov * 0 + jnp.diag(jnp.array([0.3, 0.3, 0.3]) ** 2))
+        pose = align(grid, sweep, start, wide, sigma_l, resolution)
+        m = assess(grid, sweep, pose, resolution)
+        return pose, (m.score - 0.5) * m.known
+
+    poses, values = jax.lax.map(refine, starts)
+    pose = poses[jnp.argmax(values)]
+    return pose.at[2].set(prior.mean[2] + wrap_angle(pose[2] - prior.mean[2]))

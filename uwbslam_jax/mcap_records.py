@@ -1,0 +1,351 @@
+"""MCAP as a container: topics and raw messages out of a file, whole or broken, and into a new one.
+
+Knows no message type: what the bytes of a message say is `schemas`, which topic means what is `mcap_log`.
+The records are walked here rather than by the mcap package's reader, because that one gives up on a file without
+its end, and short reads at a break would pass as messages.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+import zlib
+from bisect import bisect_right
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from operator import attrgetter
+from pathlib import Path
+from types import TracebackType
+from typing import BinaryIO, NamedTuple
+
+import lz4.frame
+import zstandard
+from mcap import records as mcap_record_types
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.writer import Writer
+
+MAGIC = b"\x89MCAP0\r\n"
+PLAIN_BLOCK_BYTES = 1 << 20  # unchunked messages are read this many bytes at a time
+MAX_CHUNK_BYTES = 1 << 30  # a chunk that claims more is taken as corrupt rather than allocated
+_HEADER = struct.Struct("<BQ")
+_MESSAGE = struct.Struct("<BQHIQQ")  # record header, channel, sequence, log time, publish time
+_CHUNK = struct.Struct("<QQQI")
+
+
+class LogError(ValueError):
+    """A recording that cannot be used; the message is one line that says what and where."""
+
+
+class _CorruptError(Exception):
+    """A chunk that does not decompress, or not to what its checksum says."""
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """One topic of a recording and how its messages are encoded.
+
+    Attributes:
+      id: number in the file.
+      topic: its name.
+      encoding: of the messages ("cdr", "ros1", "json", "protobuf").
+      schema: name of the message type, "" where the file names none.
+      schema_encoding: language of the definition ("ros2msg", "ros2idl", "ros1msg", ...).
+      definition: text or bytes of the schema.
+    """
+
+    id: int
+    topic: str
+    encoding: str
+    schema: str
+    schema_encoding: str
+    definition: bytes
+
+
+class RawMessage(NamedTuple):
+    """An undecoded message; log_time is when it was recorded [ns]."""
+
+    log_time: int
+    channel: int
+    data: bytes
+
+
+class _Block(NamedTuple):
+    """A span of the file that holds messages: the content of a chunk, or a run of messages outside any chunk."""
+
+    record: int  # where the record starts [byte]
+    offset: int  # where the content starts [byte]
+    length: int  # of the content as stored [bytes]
+    start: int  # first log time [ns]
+    size: int  # of the content once decompressed [bytes]
+    crc: int  # of the content, 0 where not known
+    compression: str
+    whole: bool  # False where the file ends inside
+
+
+def find_file(path: str | Path) -> Path:
+    """The MCAP file meant by a path: itself, or the one inside a ROS 2 bag folder. Raises LogError."""
+    path = Path(path)
+    if not path.exists():
+        raise LogError(f"{path}: no such file")
+    if not path.is_dir():
+        return path
+    files = sorted(path.glob("*.mcap"))
+    if len(files) == 1:
+        return files[0]
+    if files:
+        raise LogError(f"{path}: {len(files)} .mcap files in this folder, name one: {', '.join(f.name for f in files)}")
+    raise LogError(f"{path}: a folder without a .mcap file")
+
+
+class Recording:
+    """An MCAP file opened for reading.
+
+    Attributes:
+      path: the file read.
+      channels: every channel by its number.
+      counts: messages by channel number (of a broken file: those that are whole).
+      truncated: where and why the recording breaks, None where it does not (or is not known to, before `records`).
+      start, end: first and last log time [ns]; both 0 for a recording without messages.
+    """
+
+    def __init__(self, path: str | Path):
+        """Walks the record headers; decompresses only where the file has no summary.
+
+        Raises:
+          LogError: no such file, not an MCAP, empty, or not readable.
+        """
+        self.path = find_file(path)
+        self.channels: dict[int, Channel] = {}
+        self.counts: Counter[int] = Counter()
+        self.truncated: str | None = None
+        self.start = self.end = 0
+        self._schemas: dict[int, mcap_record_types.Schema] = {}
+        self._statistics: mcap_record_types.Statistics | None = None
+        try:
+            self.size = self.path.stat().st_size
+            with self.path.open("rb") as file:
+                self._check_magic(file)
+                self._blocks, broken_at = self._walk(file)
+                self._take_stock(file, broken_at)
+        except OSError as error:
+            raise LogError(f"{self.path}: {error.strerror or error}") from None
+
+    def records(self, channels: set[int] | None = None) -> Iterator[RawMessage]:
+        """Yields the messages of these channels (all by default) by log time, equal ones in file order.
+
+        Chunks whose times overlap are merged, so that memory grows with the overlap, not with the file. Sets
+        `truncated` and ends where a chunk turns out corrupt.
+        """
+        pending: list[RawMessage] = []
+        last = self.start
+        with self.path.open("rb") as file:
+            for index, block in enumerate(self._blocks):
+                try:
+                    pending += self._messages(self._content(file, block), channels)
+                except _CorruptError as error:
+                    self._break(block.record, max([last, *(m.log_time for m in pending)]), str(error))
+                    break
+                pending.sort(key=attrgetter("log_time"))
+                ahead = self._blocks[index + 1].start if index + 1 < len(self._blocks) else None
+                cut = len(pending) if ahead is None else bisect_right(pending, ahead, key=attrgetter("log_time"))
+                ready, pending = pending[:cut], pending[cut:]
+                last = ready[-1].log_time if ready else last
+                yield from ready
+        yield from pending
+
+    def _check_magic(self, file: BinaryIO) -> None:
+        head = file.read(16)
+        if not head:
+            raise LogError(f"{self.path}: the file is empty")
+        if head.startswith(MAGIC):
+            return
+        known = {b"#ROSBAG": "a ROS 1 bag", b"SQLite format 3": "a ROS 2 bag in SQLite storage"}
+        found = next((f"{name}: convert it to MCAP" for magic, name in known.items() if head.startswith(magic)), None)
+        raise LogError(f"{self.path}: not an MCAP file{f' but {found}' if found else ''}")
+
+    def _walk(self, file: BinaryIO) -> tuple[list[_Block], int | None]:
+        """Record by record through the file; returns the blocks and the byte where it breaks, None if it ends well."""
+        blocks: list[_Block] = []
+        position = len(MAGIC)
+        while True:
+            file.seek(position)
+            header = file.read(_MESSAGE.size)
+            if len(header) < _HEADER.size:
+                return blocks, position
+            opcode, length = _HEADER.unpack_from(header)
+            end = position + _HEADER.size + length
+            if opcode == Opcode.CHUNK:
+                block = self._chunk_at(file, position)
+                blocks += [block] if block else []
+                if block is None or not block.whole:
+                    return blocks, position
+            elif opcode == 0 or end > self.size:  # 0 is no opcode: a file that was allocated and never written
+                return blocks, position
+            elif opcode == Opcode.MESSAGE and len(header) == _MESSAGE.size:
+                _add_plain(blocks, position, end - position, _MESSAGE.unpack(header)[4])
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS):
+                file.seek(position + _HEADER.size)
+                self._learn(opcode, file.read(length))
+            elif opcode == Opcode.FOOTER:
+                file.seek(end)
+                return blocks, (None if file.read(len(MAGIC)) == MAGIC else end)
+            position = end
+
+    def _chunk_at(self, file: BinaryIO, position: int) -> _Block | None:
+        """The chunk record at this byte, None where not even its head is whole."""
+        file.seek(position)
+        head = file.read(_HEADER.size + _CHUNK.size + 4)
+        if len(head) < _HEADER.size + _CHUNK.size + 4:
+            return None
+        start, _, size, crc = _CHUNK.unpack_from(head, _HEADER.size)
+        (name_length,) = struct.unpack_from("<I", head, _HEADER.size + _CHUNK.size)
+        if name_length > 64:  # "zstd" or "lz4": anything long is noise
+            return None
+        tail = file.read(name_length + 8)
+        if len(tail) < name_length + 8:
+            return None
+        (length,) = struct.unpack_from("<Q", tail, name_length)
+        offset = position + len(head) + len(tail)
+        compression = tail[:name_length].decode("utf-8", "replace")
+        stored = min(length, self.size - offset)
+        return _Block(position, offset, stored, start, size, crc, compression, stored == length)
+
+    def _take_stock(self, file: BinaryIO, broken_at: int | None) -> None:
+        """Channels, counts and times: from the summary, or by reading through where there is none."""
+        statistics = self._statistics
+        if broken_at is None and statistics is not None and statistics.channel_count <= len(self.channels):
+            self.counts.update(statistics.channel_message_counts)
+            self.start, self.end = statistics.message_start_time, statistics.message_end_time
+        else:
+            for index, block in enumerate(self._blocks):
+                try:
+                    messages = self._messages(self._content(file, block), None)
+                except _CorruptError as error:
+                    del self._blocks[index:]
+                    self._break(block.record, self.end, str(error))
+                    break
+                self.counts.update(message.channel for message in messages)
+                for time in (m.log_time for m in messages):
+                    self.start = min(self.start or time, time)
+                    self.end = max(self.end, time)
+        if broken_at is not None and self.truncated is None:
+            self._break(broken_at, self.end, "")
+        self._blocks.sort(key=attrgetter("start"))
+
+    def _content(self, file: BinaryIO, block: _Block) -> bytes:
+        """The records of a block, decompressed; of a block that the file ends in, those bytes that are there."""
+        file.seek(block.offset)
+        stored = file.read(block.length)
+        if block.size > MAX_CHUNK_BYTES or block.compression not in ("", "zstd", "lz4"):
+            raise _CorruptError(f"a chunk of {block.size} bytes, compression {block.compression!r}, is not supported")
+        try:
+            if block.compression == "zstd":  # not in one shot: of a frame cut off we want what is there
+                content = zstandard.ZstdDecompressor().decompressobj().decompress(stored)
+            elif block.compression == "lz4":
+                content = lz4.frame.LZ4FrameDecompressor().decompress(stored)
+            else:
+                content = stored
+        except (zstandard.ZstdError, RuntimeError, ValueError, EOFError, MemoryError):
+            if block.whole:
+                raise _CorruptError("a chunk does not decompress") from None
+            return b""
+        if block.whole and (len(content) != block.size or (block.crc and zlib.crc32(content) != block.crc)):
+            raise _CorruptError("a chunk does not match its checksum")
+        return content
+
+    def _messages(self, content: bytes, channels: set[int] | None) -> list[RawMessage]:
+        """Whole messages of these channels in file order; schemas and channels on the way are learnt."""
+        found: list[RawMessage] = []
+        position, size = 0, len(content)
+        while position + _HEADER.size <= size:
+            opcode, length = _HEADER.unpack_from(content, position)
+            end = position + _HEADER.size + length
+            if end > size:
+                break
+            if opcode == Opcode.MESSAGE and length >= _MESSAGE.size - _HEADER.size:
+                _, _, channel, _, log_time, _ = _MESSAGE.unpack_from(content, position)
+                if channels is None or channel in channels:
+                    found.append(RawMessage(log_time, channel, content[position + _MESSAGE.size : end]))
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                self._learn(opcode, content[position + _HEADER.size : end])
+            position = end
+        return found
+
+    def _learn(self, opcode: int, content: bytes) -> None:
+        """Takes in a schema, channel or statistics record; one that does not parse is left out."""
+        stream = ReadDataStream(io.BytesIO(content))
+        try:
+            if opcode == Opcode.SCHEMA:
+                schema = mcap_record_types.Schema.read(stream)
+                self._schemas[schema.id] = schema
+            elif opcode == Opcode.STATISTICS:
+                self._statistics = mcap_record_types.Statistics.read(stream)
+            else:
+                channel = mcap_record_types.Channel.read(stream)
+                schema = self._schemas.get(channel.schema_id)
+                about = (schema.name, schema.encoding, schema.data) if schema else ("", "", b"")
+                self.channels[channel.id] = Channel(channel.id, channel.topic, channel.message_encoding, *about)
+        except (McapError, struct.error, ValueError):
+            pass
+
+    def _break(self, byte: int, last: int, why: str) -> None:
+        seconds = max(last - self.start, 0) * 1e-9
+        where = f"recording breaks after {seconds:.1f} s (byte {byte} of {self.size})"
+        self.truncated = f"{where}: {why}" if why else where
+
+
+def _add_plain(blocks: list[_Block], position: int, length: int, log_time: int) -> None:
+    """Appends a message outside any chunk to the run before it, or begins a new run."""
+    if blocks:
+        last = blocks[-1]
+        joined = last.length + length
+        if last.record == last.offset and last.offset + last.length == position and joined <= PLAIN_BLOCK_BYTES:
+            blocks[-1] = last._replace(length=joined, size=joined, start=min(last.start, log_time))
+            return
+    blocks.append(_Block(position, position, length, log_time, length, 0, "", True))
+
+
+class RecordWriter:
+    """Writes an MCAP file of profile ros2 in zstd chunks; a context manager that always finishes the file."""
+
+    def __init__(self, path: str | Path, *, chunk_size: int = 1 << 17):
+        """Opens the file. A killed process loses at most the last `chunk_size` bytes of messages. Raises LogError."""
+        self.path = Path(path)
+        try:
+            self._file = self.path.open("wb")
+        except OSError as error:
+            raise LogError(f"{self.path}: {error.strerror or error}") from None
+        self._writer = Writer(self._file, chunk_size=chunk_size)
+        self._writer.start(profile="ros2", library="uwbslam_jax")
+        self._schema_ids: dict[str, int] = {}
+        self._sequence: Counter[int] = Counter()
+
+    def add_topic(self, topic: str, schema: str, definition: bytes) -> int:
+        """Registers a topic of CDR messages with its ros2msg definition; returns the number to write with."""
+        if schema not in self._schema_ids:
+            self._schema_ids[schema] = self._writer.register_schema(schema, "ros2msg", definition)
+        return self._writer.register_channel(topic, "cdr", self._schema_ids[schema])
+
+    def write(self, channel: int, data: bytes | memoryview, log_time: int) -> None:
+        """Writes one message [ns]."""
+        self._writer.add_message(channel, log_time, bytes(data), log_time, self._sequence[channel])
+        self._sequence[channel] += 1
+
+    def flush(self) -> None:
+        """Hands the finished chunks to the operating system."""
+        self._file.flush()
+
+    def close(self) -> None:
+        """Writes the summary and closes the file; a second call does nothing."""
+        if not self._file.closed:
+            self._writer.finish()
+            self._file.close()
+
+    def __enter__(self) -> RecordWriter:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None):
+        self.close()

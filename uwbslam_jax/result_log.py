@@ -1,0 +1,241 @@
+"""A Result as a ROS 2 recording for Foxglove and RViz: map, path, poses, transforms, beacons and diagnostics."""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from uwbslam_jax.mcap_records import RecordWriter
+from uwbslam_jax.result import BeaconEstimate, MapImage, Result
+from uwbslam_jax.ros_types import build, definition, header, pose, quaternion, serialize, time, vector
+
+DIAGNOSTICS_PERIOD = 100_000_000  # at most 10 Hz [ns]
+BEACONS_PERIOD = 1_000_000_000  # about 1 Hz [ns]
+MAP_FRAME, ROBOT_FRAME, UWB_FRAME = "map", "base_link", "uwb"
+_COLORS = {  # of a beacon, by status
+    "static": (0.1, 0.6, 0.2),
+    "moving": (0.9, 0.5, 0.0),
+    "silent": (0.5, 0.5, 0.5),
+    "dropped": (0.8, 0.1, 0.1),
+}
+
+
+class _Item(NamedTuple):
+    """A message to be built when its turn comes, so that only one is in memory."""
+
+    stamp: int
+    topic: str
+    build: Callable[[], Any]
+
+
+def write_result_log(result: Result, path: str | Path) -> None:
+    """Writes result.mcap, messages in the order of their stamps.
+
+    The final map and path come first, so that a viewer shows them from the start on.
+
+    Raises:
+      LogError: the file cannot be opened.
+    """
+    known = np.flatnonzero(np.isfinite(result.poses).all(axis=1)) if len(result.stamps) else np.zeros(0, int)
+    start = int(result.stamps[0]) if len(result.stamps) else 0
+    streams = [
+        _once(result, start, known),
+        _poses(result, known),
+        _beacons(result, start),
+        _diagnostics(result),
+    ]
+    channels: dict[str, int] = {}
+    with RecordWriter(path, chunk_size=1 << 20) as records:
+        for item in heapq.merge(*streams, key=lambda item: item.stamp):
+            message = item.build()
+            if item.topic not in channels:
+                schema = message.__msgtype__
+                channels[item.topic] = records.add_topic(item.topic, schema, definition(schema))
+            records.write(channels[item.topic], serialize(message), item.stamp)
+
+
+def crop(image: MapImage) -> MapImage:
+    """The smallest part of a map that holds every observed cell; a single unknown cell where there is none."""
+    rows, columns = (np.flatnonzero((image.log_odds != 0).any(axis=axis)) for axis in (1, 0))
+    if rows.size == 0:
+        return MapImage(np.zeros((1, 1), np.float32), image.resolution, np.asarray(image.origin, dtype=np.float64))
+    part = image.log_odds[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    origin = np.asarray(image.origin, dtype=np.float64) + image.resolution * np.array([columns[0], rows[0]])
+    return MapImage(part, image.resolution, origin)
+
+
+def _once(result: Result, start: int, known: np.ndarray) -> Iterator[_Item]:
+    yield _Item(start, "/tf", lambda: _transform(start, UWB_FRAME, 0.0, 0.0, 0.0))
+    yield _Item(start, "/map", lambda: _grid(result.map, start))
+    yield _Item(start, "/path", lambda: _path(result, start, known))
+
+
+def _poses(result: Result, known: np.ndarray) -> Iterator[_Item]:
+    for index in known:
+        stamp, (x, y, yaw) = int(result.stamps[index]), result.poses[index].tolist()
+        cov = result.pose_covs[index]
+        yield _Item(stamp, "/pose", lambda s=stamp, x=x, y=y, yaw=yaw, cov=cov: _pose(s, x, y, yaw, cov))
+        yield _Item(stamp, "/tf", lambda s=stamp, x=x, y=y, yaw=yaw: _transform(s, ROBOT_FRAME, x, y, yaw))
+
+
+def _beacons(result: Result, start: int) -> Iterator[_Item]:
+    """Beacons as known at each second, then the final ones with their ellipses."""
+    if not len(result.stamps):
+        return
+    end = int(result.stamps[-1])
+    for stamp in range(start, end, BEACONS_PERIOD):
+        seconds = (stamp - start) * 1e-9
+        tracks = sorted(result.beacon_tracks.items())
+        past = {number: int(np.searchsorted(track[:, 0], seconds, side="right")) for number, track in tracks}
+        known = {number: track[past[number] - 1] for number, track in tracks if past[number]}
+        if known:
+            yield _Item(stamp, "/beacons", lambda s=stamp, known=known: _track_markers(s, known))
+    yield _Item(end, "/beacons", lambda: _final_markers(end, result.beacons))
+
+
+def _diagnostics(result: Result) -> Iterator[_Item]:
+    last: int | None = None
+    for index, stamp in enumerate(result.stamps.tolist() if result.diagnostics else []):
+        if last is None or stamp - last >= DIAGNOSTICS_PERIOD:
+            last = stamp
+            yield _Item(stamp, "/diagnostics", lambda s=stamp, index=index: _status(s, result.diagnostics, index))
+
+
+def _pose(stamp: int, x: float, y: float, yaw: float, cov: np.ndarray) -> Any:
+    """PoseWithCovarianceStamped; (3, 3) over x, y, yaw goes to rows and columns 0, 1, 5 of the 6 x 6."""
+    full = np.zeros((6, 6))
+    full[np.ix_([0, 1, 5], [0, 1, 5])] = np.nan_to_num(cov)  # RViz refuses a NaN
+    body = build("geometry_msgs/msg/PoseWithCovariance", pose=pose(x, y, yaw), covariance=full.ravel())
+    return build("geometry_msgs/msg/PoseWithCovarianceStamped", header=header(stamp, MAP_FRAME), pose=body)
+
+
+def _transform(stamp: int, child: str, x: float, y: float, yaw: float) -> Any:
+    """TFMessage with one transform from the map."""
+    moved = build("geometry_msgs/msg/Transform", translation=vector("Vector3", x, y), rotation=quaternion(yaw))
+    stamped = build(
+        "geometry_msgs/msg/TransformStamped", header=header(stamp, MAP_FRAME), child_frame_id=child, transform=moved
+    )
+    return build("tf2_msgs/msg/TFMessage", transforms=[stamped])
+
+
+def _path(result: Result, stamp: int, known: np.ndarray) -> Any:
+    """Path of every pose."""
+    poses = [
+        build(
+            "geometry_msgs/msg/PoseStamped",
+            header=header(int(result.stamps[index]), MAP_FRAME),
+            pose=pose(*result.poses[index].tolist()),
+        )
+        for index in known
+    ]
+    return build("nav_msgs/msg/Path", header=header(stamp, MAP_FRAME), poses=poses)
+
+
+def _grid(image: MapImage, stamp: int) -> Any:
+    """OccupancyGrid of the observed part: -1 unknown, else the probability of being occupied in percent."""
+    image = crop(image)
+    percent = np.rint(100.0 / (1.0 + np.exp(-image.log_odds.astype(np.float64))))
+    data = np.where(image.log_odds == 0, -1, percent).astype(np.int8)
+    rows, columns = data.shape
+    info = build(
+        "nav_msgs/msg/MapMetaData",
+        map_load_time=time(stamp),
+        resolution=float(image.resolution),
+        width=columns,
+        height=rows,
+        origin=pose(float(image.origin[0]), float(image.origin[1]), 0.0),
+    )
+    return build("nav_msgs/msg/OccupancyGrid", header=header(stamp, MAP_FRAME), info=info, data=data.ravel())
+
+
+def _track_markers(stamp: int, known: dict[int, np.ndarray]) -> Any:
+    """MarkerArray of beacons on the way, rows t, x, y, sigma: a post, its id and a 2-sigma circle."""
+    markers: list[Any] = []
+    for number, (_, x, y, sigma) in known.items():
+        markers += _beacon(stamp, number, (float(x), float(y), 0.0), (float(sigma), float(sigma)), "static")
+    return build("visualization_msgs/msg/MarkerArray", markers=markers)
+
+
+def _final_markers(stamp: int, beacons: list[BeaconEstimate]) -> Any:
+    """MarkerArray of the last estimates, with 2-sigma ellipses."""
+    markers: list[Any] = []
+    for beacon in beacons:
+        values, vectors = np.linalg.eigh(np.asarray(beacon.cov, dtype=np.float64))
+        small, large = np.sqrt(np.maximum(values, 0.0))
+        place = float(beacon.position[0]), float(beacon.position[1]), math.atan2(vectors[1, 1], vectors[0, 1])
+        markers += _beacon(stamp, beacon.id, place, (float(large), float(small)), beacon.status)
+    return build("visualization_msgs/msg/MarkerArray", markers=markers)
+
+
+def _beacon(
+    stamp: int, number: int, place: tuple[float, float, float], sigmas: tuple[float, float], status: str
+) -> list[Any]:
+    """Post, text and ellipse of a beacon at x, y with the ellipse's bearing [m, m, rad]; sigmas of its axes [m]."""
+    x, y, bearing = place
+    color = _COLORS.get(status, _COLORS["silent"])
+    text = str(number) if status == "static" else f"{number} {status}"
+    ellipse = tuple(max(4.0 * sigma, 0.01) for sigma in sigmas)  # 2 sigma to both sides, never invisible
+    return [
+        _marker(stamp, "beacon", number, 3, (x, y, 0.5), 0.0, (0.12, 0.12, 1.0), (*color, 1.0)),
+        _marker(stamp, "id", number, 9, (x, y, 1.3), 0.0, (0.0, 0.0, 0.4), (0.1, 0.1, 0.1, 1.0), text),
+        _marker(stamp, "sigma", number, 3, (x, y, 0.01), bearing, (*ellipse, 0.02), (*color, 0.4)),
+    ]
+
+
+def _marker(
+    stamp: int,
+    namespace: str,
+    number: int,
+    kind: int,
+    xyz: tuple[float, float, float],
+    yaw: float,
+    size: tuple[float, ...],
+    rgba: tuple[float, ...],
+    text: str = "",
+) -> Any:
+    """visualization_msgs/Marker; kind 3 is a cylinder, 9 a text that faces the viewer."""
+    place = build("geometry_msgs/msg/Pose", position=vector("Point", *xyz), orientation=quaternion(yaw))
+    return build(
+        "visualization_msgs/msg/Marker",
+        header=header(stamp, MAP_FRAME),
+        ns=namespace,
+        id=number & 0x7FFFFFFF,  # ids are uint32, a marker's number is int32
+        type=kind,
+        action=0,
+        pose=place,
+        scale=vector("Vector3", *size),
+        color=build("std_msgs/msg/ColorRGBA", **dict(zip("rgba", map(float, rgba), strict=True))),
+        lifetime=build("builtin_interfaces/msg/Duration", sec=0, nanosec=0),
+        frame_locked=False,
+        points=[],
+        colors=[],
+        texture_resource="",
+        texture=build("sensor_msgs/msg/CompressedImage", header=header(0, ""), format="", data=np.zeros(0, np.uint8)),
+        uv_coordinates=[],
+        text=text,
+        mesh_resource="",
+        mesh_file=build("visualization_msgs/msg/MeshFile", filename="", data=np.zeros(0, np.uint8)),
+        mesh_use_embedded_materials=False,
+    )
+
+
+def _status(stamp: int, diagnostics: dict[str, np.ndarray], index: int) -> Any:
+    """DiagnosticArray with the values of one frame."""
+    values = [
+        build("diagnostic_msgs/msg/KeyValue", key=name, value=f"{float(series[index]):.6g}")
+        for name, series in diagnostics.items()
+    ]
+    status = build(
+        "diagnostic_msgs/msg/DiagnosticStatus",
+        level=0,
+        name="uwbslam",
+        message="",
+        hardware_id="",
+        values=values,
+    )
+    return build("diagnostic_msgs/msg/DiagnosticArray", header=header(stamp, ""), status=[status])

@@ -1,0 +1,262 @@
+"""One step: a frame of measurements in, the corrected state and its estimate out. Reads like the list of steps.
+
+    predict -> ranges -> match -> fuse -> draw                                    (preset "robust", DESIGN 1.1-1.9)
+
+Pure functions of fixed shape; a beacon that joins or drops changes a mask. Start-up and beacon life are not here.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from uwbslam_jax import grid as occupancy
+from uwbslam_jax import layout, matching, motion, ranging
+from uwbslam_jax.config import Config, Params
+from uwbslam_jax.ekf import Gaussian, update_information
+from uwbslam_jax.geometry import rotation, transform_points, wrap_angle
+from uwbslam_jax.grid import Grid, Sweep
+from uwbslam_jax.matching import Match
+from uwbslam_jax.measurements import Frame, Scan
+
+_KNOWN_ENOUGH = 0.25
+"""Share of returns on observed cells below which a score says nothing: the robot looks at new ground."""
+_POOR_SCORE = 0.55
+_LOST_SCORE = 0.5
+_SURPRISE = 30.0
+"""Squared Mahalanobis distance of a match beyond which it is not believed (chi-square, 3: 1e-6)."""
+_MATCH_FLOOR = (0.004, 0.004, 0.0006)
+"""Error of any match beyond what its Hessian tells: cells, drawn walls [m, m, rad]."""
+_ALIGN_FLOOR = (0.1, 0.1, 0.05)
+"""Alignment is LiDAR's business: the prior that holds it is never tighter than this [m, m, rad]."""
+_DRAW_MOVED = (0.1, 0.05)
+"""A scan is drawn when the robot has moved or turned this much since the last one [m, rad]."""
+_DRAW_FIRST = 10
+"""The first scans are all drawn: there is no map yet to be blurred."""
+_DRAW_PULL = (0.015, 0.0026)
+"""New ground is drawn at most this far from the match towards the fused pose [m, rad]."""
+
+
+class State(NamedTuple):
+    """All that a step carries to the next; n = 4 K + 5, see `layout`.
+
+    Attributes:
+      belief: over the state vector.
+      active: (K,) slots in use, the robot's always.
+      moving: (K,) nodes taken to be carried about.
+      grid: the map's window.
+      drawn_pose: (3,) where the last scan was drawn.
+      scans_drawn: how many were.
+      novelty: share of the last drawn scan that fell on new ground.
+    """
+
+    belief: Gaussian
+    active: Bool[Array, "K"]
+    moving: Bool[Array, "K"]
+    grid: Grid
+    drawn_pose: Float[Array, "3"]
+    scans_drawn: Int[Array, ""]
+    novelty: Float[Array, ""]
+
+
+class Estimate(NamedTuple):
+    """What a step reports, in the frame of the state.
+
+    Attributes:
+      pose, pose_cov: (3,), (3, 3) the robot [m, m, rad].
+      velocity: (2,) [m/s]; yaw_rate [rad/s].
+      beacons, beacon_covs: (K, 2), (K, 2, 2) [m]; slot 0 is the robot.
+      active, moving: (K,).
+      matched_pose: (3,) what the match reported, before the map's own error is taken off.
+      information: (3, 3) what the match told about it [1/m^2 ...]; 0 where it told nothing.
+      score, known: of the match, see Match.
+      poor, searched, drawn: what happened to the scan.
+      innovation, normalised, weight: (M,) of the ranges.
+      log_likelihood: of the ranges.
+    """
+
+    pose: Float[Array, "3"]
+    pose_cov: Float[Array, "3 3"]
+    velocity: Float[Array, "2"]
+    yaw_rate: Float[Array, ""]
+    beacons: Float[Array, "K 2"]
+    beacon_covs: Float[Array, "K 2 2"]
+    active: Bool[Array, "K"]
+    moving: Bool[Array, "K"]
+    matched_pose: Float[Array, "3"]
+    information: Float[Array, "3 3"]
+    score: Float[Array, ""]
+    known: Float[Array, ""]
+    poor: Bool[Array, ""]
+    searched: Bool[Array, ""]
+    drawn: Bool[Array, ""]
+    innovation: Float[Array, "M"]
+    normalised: Float[Array, "M"]
+    weight: Float[Array, "M"]
+    log_likelihood: Float[Array, ""]
+
+
+def init(config: Config) -> State:
+    """The robot at the origin of its own start frame, no beacon, no map."""
+    n = layout.state_size(config.nodes)
+    variance = jnp.ones(n, jnp.float32)
+    pose = jnp.array(layout.pose_indices(config.nodes))
+    error = jnp.array(layout.map_error_indices(config.nodes))
+    # the frame is the start pose: known exactly, and so is the map drawn from it
+    variance = variance.at[pose].set(1e-8).at[error].set(1e-8)
+    return State(
+        belief=Gaussian(jnp.zeros(n, jnp.float32), jnp.diag(variance)),
+        active=jnp.zeros(config.nodes, bool).at[0].set(True),
+        moving=jnp.zeros(config.nodes, bool),
+        grid=occupancy.empty(config.cells, config.levels, config.resolution),
+        drawn_pose=jnp.zeros(3, jnp.float32),
+        scans_drawn=jnp.zeros((), jnp.int32),
+        novelty=jnp.zeros((), jnp.float32),
+    )
+
+
+def step(config: Config, params: Params, state: State, frame: Frame) -> tuple[State, Estimate]:
+    """One frame through the estimator (preset "robust").
+
+    Differentiable in params, state and frame except through its decisions (search, drawing, cells), which are held.
+    """
+    belief = motion.predict(state.belief, params, frame.dt, frame.odometry, state.moving, state.novelty)
+    belief, used = _use_ranges(config, params, state, belief, frame)
+    sweep = undo_motion(frame.scan, params.lidar, belief.mean)
+    match, searched = _match(config, params, state, belief, sweep, frame.has_scan)
+    surprise, information = _trust(match, belief, params)
+    poor = ((match.known > _KNOWN_ENOUGH) & (match.score < _LOST_SCORE)) | (surprise > _SURPRISE)
+    trusted = frame.has_scan & ~poor
+    information = jnp.where(trusted, information, 0.0)
+    belief = _fuse(belief, match.pose, information)
+    state, drawn = _draw(config, state._replace(belief=belief), match, sweep, trusted)
+    return state, _report(state, match, information, used, poor=poor & frame.has_scan, searched=searched, drawn=drawn)
+
+
+def undo_motion(scan: Scan, lidar: Float[Array, "3"], vector: Float[Array, "n"]) -> Sweep:
+    """The scan in the robot's frame at its stamp: each beam placed at its own time with velocity and yaw rate."""
+    s = layout.unpack(vector)
+    index = jnp.arange(scan.ranges.shape[0], dtype=scan.ranges.dtype)
+    bearing = scan.angle_min + scan.angle_increment * index
+    age = scan.time_increment * index
+    reach = jnp.where(scan.valid, scan.ranges, 0.0)
+    turn = s.yaw_rate * age
+    drift = rotation(-s.heading) @ s.velocities[0]
+    c, sn = jnp.cos(bearing + lidar[2]), jnp.sin(bearing + lidar[2])
+    x, y = lidar[0] + reach * c, lidar[1] + reach * sn
+    ct, st = jnp.cos(turn), jnp.sin(turn)
+    points = jnp.stack([ct * x - st * y + drift[0] * age, st * x + ct * y + drift[1] * age], axis=-1)
+    step = scan.angle_increment + s.yaw_rate * scan.time_increment
+    return Sweep(points, scan.valid, lidar, scan.angle_min, step, reach)
+
+
+def _use_ranges(config, params, state, belief, frame):
+    r = frame.ranges
+    usable = r.valid & state.active[r.i] & state.active[r.j] & (not config.lidar_only)
+    usable = usable & ranging.line_of_sight(r, config.nlos_gap_db)
+    return ranging.update(belief, r, usable, params, robust=True)
+
+
+def _match(config, params, state, belief, sweep, has_scan) -> tuple[Match, Bool[Array, ""]]:
+    C = layout.matched_pose_jacobian(config.nodes)
+    prior = Gaussian(C @ belief.mean, C @ belief.cov @ C.T + jnp.diag(jnp.array(_ALIGN_FLOOR) ** 2))
+    start = prior.mean
+    pose = matching.align(state.grid, sweep, start, prior, params.sigma_l, config.resolution)
+    match = matching.assess(state.grid, sweep, pose, config.resolution)
+    wanted = has_scan & (match.known > _KNOWN_ENOUGH) & (match.score < _POOR_SCORE)
+
+    def wide(_):
+        found = matching.search(state.grid, sweep, prior, params.sigma_l, config.resolution)
+        other = matching.assess(state.grid, sweep, found, config.resolution)
+        better = (other.score - 0.5) * other.known > (match.score - 0.5) * match.known + 0.02
+        return jax.tree.map(lambda a, b: jnp.where(better, a, b), other, match)
+
+    return lax.cond(wanted, wide, lambda _: match, None), wanted
+
+
+def _trust(match: Match, belief: Gaussian, params: Params) -> tuple[Float[Array, ""], Float[Array, "3 3"]]:
+    """How surprising a match is, and its information about pose + map error.
+
+    The information is its Hessian, for the share of beams that count as independent, and never better than the floor
+    (Y^-1 + floor)^-1. The surprise is the squared Mahalanobis distance to what was expected; information falls with
+    it as with a range's (Geman-McClure), so that a plausible match of the wrong place cannot drag the state.
+    """
+    Y = match.information * (params.beam_share / params.sigma_l**2)
+    floor = jnp.diag(jnp.array(_MATCH_FLOOR) ** 2)
+    Y = jnp.linalg.solve(jnp.eye(3) + Y @ floor, Y)
+    C = layout.matched_pose_jacobian(layout.node_count(belief.mean.shape[0]))
+    innovation = match.pose - C @ belief.mean
+    # nu^T (Pz + Y^-1)^-1 nu without the inverse of a Y that may be singular
+    surprise = innovation @ jnp.linalg.solve(jnp.eye(3) + Y @ (C @ belief.cov @ C.T), Y @ innovation)
+    return surprise, Y / (1.0 + surprise / _SURPRISE) ** 2
+
+
+def _fuse(belief: Gaussian, pose: Float[Array, "3"], information: Float[Array, "3 3"]) -> Gaussian:
+    """EKF update by a matched pose, of which the map's own error is a part (match hard, fuse soft; DESIGN 1.9)."""
+    C = layout.matched_pose_jacobian(layout.node_count(belief.mean.shape[0]))
+    innovation = pose - C @ belief.mean
+    innovation = innovation.at[2].set(wrap_angle(innovation[2]))
+    return update_information(belief, C.T @ information @ C, C.T @ (information @ innovation))
+
+
+def _draw(config, state, match, sweep, trusted):
+    s = layout.unpack(state.belief.mean)
+    moved = jnp.hypot(*(match.pose[:2] - state.drawn_pose[:2])) > _DRAW_MOVED[0]
+    turned = jnp.abs(match.pose[2] - state.drawn_pose[2]) > _DRAW_MOVED[1]
+    wanted = trusted & (moved | turned | (state.scans_drawn < _DRAW_FIRST))
+    novelty = _novelty(config, state.grid, sweep, match.pose)
+    limit = jnp.array([_DRAW_PULL[0], _DRAW_PULL[0], _DRAW_PULL[1]])
+    pose = match.pose - jnp.clip(0.5 * s.map_error, -limit, limit)
+    levels = lax.cond(
+        wanted, lambda g: occupancy.integrate(g, pose, sweep, config.resolution), lambda g: g, state.grid
+    )
+    state = state._replace(
+        grid=levels,
+        drawn_pose=jnp.where(wanted, match.pose, state.drawn_pose),
+        scans_drawn=state.scans_drawn + wanted,
+        novelty=jnp.where(wanted & (state.scans_drawn > 0), novelty, 0.0),
+    )
+    return state, wanted
+
+
+def _novelty(config, grid, sweep, pose):
+    """Share of the returns that end where the coarsest level has no wall yet."""
+    k = len(grid.levels) - 1
+    ends = transform_points(pose, sweep.points)
+    gamma = occupancy.lookup(grid, ends, config.resolution, k)
+    new = sweep.valid & (gamma < 0.55)
+    return jnp.sum(new) / jnp.maximum(jnp.sum(sweep.valid), 1)
+
+
+def _report(state, match, information, used, *, poor, searched, drawn) -> Estimate:
+    s = layout.unpack(state.belief.mean)
+    k = s.positions.shape[0]
+    at = jnp.array(layout.pose_indices(k))
+    P = state.belief.cov
+    blocks = P[: 2 * k, : 2 * k].reshape(k, 2, k, 2)
+    node = jnp.arange(k)
+    return Estimate(
+        pose=layout.robot_pose(state.belief.mean),
+        pose_cov=P[at[:, None], at[None, :]],
+        velocity=s.velocities[0],
+        yaw_rate=s.yaw_rate,
+        beacons=s.positions,
+        beacon_covs=blocks[node, :, node, :],
+        active=state.active,
+        moving=state.moving,
+        matched_pose=match.pose,
+        information=information,
+        score=match.score,
+        known=match.known,
+        poor=poor,
+        searched=searched,
+        drawn=drawn,
+        innovation=used.innovation,
+        normalised=used.normalised,
+        weight=used.weight,
+        log_likelihood=used.log_likelihood,
+    )

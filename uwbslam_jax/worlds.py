@@ -1,0 +1,349 @@
+"""Worlds of line segments to simulate in: a workshop, random halls, a corridor, an office; and exact ray casting.
+
+A world is walls and furniture seen from above. Nothing here moves, measures or knows noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+
+import numpy as np
+
+from uwbslam_jax.paths import Track
+
+Point = Sequence[float] | np.ndarray
+"""x, y [m]."""
+CLEARANCE = 0.7
+"""Furniture stays this far from the route [m]."""
+WIDEST_CORNER = 1.5
+"""Routes of a corner radius up to this keep the clearance [m]."""
+
+
+@dataclass(frozen=True)
+class World:
+    """A place seen from above.
+
+    Attributes:
+      segments: (S, 4) float64, x1, y1, x2, y2 of each piece of wall or furniture [m].
+      name: what it is.
+      lap: (W, 2) waypoints of a route that is free of obstacles [m]; closed, but for the corridor.
+      outline: (V, 2) corners of the floor [m].
+    """
+
+    segments: np.ndarray
+    name: str
+    lap: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    outline: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+
+    def placed(self, pose: Sequence[float]) -> World:
+        """This world turned by pose[2] [rad], then shifted by pose[:2] [m]."""
+        segments = place(pose, self.segments.reshape(-1, 2)).reshape(-1, 4)
+        return replace(self, segments=segments, lap=place(pose, self.lap), outline=place(pose, self.outline))
+
+
+def place(pose: Sequence[float], points: np.ndarray) -> np.ndarray:
+    """points (n, 2) [m] from the frame at pose (x, y [m], yaw [rad]) into the frame that pose is given in, (n, 2)."""
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    return points @ np.array([[c, s], [-s, c]]) + np.asarray(pose[:2])
+
+
+# Ray casting ---------------------------------------------------------------------------------------------------------
+
+
+def cast(segments: np.ndarray, origins: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    """Distance along each ray to the first segment that it meets.
+
+    A segment is tried only against the rays whose bearing falls into the arc under which it is seen, so the cost is
+    that of the crossings and not rays times segments.
+
+    Args:
+      segments: (S, 4) [m].
+      origins: (2,) or (B, 2) start of each ray [m]; they may differ by what a robot drives during one sweep.
+      angles: (B,) bearing of each ray in the world [rad], increasing, of at most one turn in all.
+    Returns:
+      (B,) distance [m], inf where nothing is met.
+    """
+    origins = np.broadcast_to(np.asarray(origins, float), (angles.size, 2))
+    ray, wall = _candidates(segments, origins, angles)
+    start, along = segments[wall, :2], segments[wall, 2:] - segments[wall, :2]
+    direction = np.stack([np.cos(angles), np.sin(angles)], -1)[ray]
+    to_start = start - origins[ray]
+    det = _cross(direction, along)
+    with np.errstate(divide="ignore", invalid="ignore"):  # a ray parallel to a wall: 0/0 fails the test below
+        distance = _cross(to_start, along) / det
+        share = _cross(to_start, direction) / det
+    # A hair more than [0, 1], else rounding lets a ray slip through the corner that two walls share.
+    hit = (distance > 0.0) & (share >= -1e-12) & (share <= 1.0 + 1e-12)
+    result = np.full(angles.size, np.inf)
+    np.minimum.at(result, ray[hit], distance[hit])
+    return result
+
+
+def _candidates(segments: np.ndarray, origins: np.ndarray, angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Indices (ray, segment) of all pairs that may meet, both (n,)."""
+    centre = 0.5 * (origins.min(0) + origins.max(0))
+    spread = float(np.max(np.hypot(*(origins - centre).T)))
+    first, second = segments[:, :2] - centre, segments[:, 2:] - centre
+    bearing = np.arctan2(first[:, 1], first[:, 0])
+    arc = np.arctan2(_cross(first, second), np.sum(first * second, -1))  # signed, seen from the centre
+    near = point_segment_distance(np.zeros((1, 2)), np.hstack([first, second]))[0]
+    # Seen from an origin `spread` beside the centre the arc widens by at most asin(spread / distance).
+    pad = np.where(near > 2.0 * spread + 1e-6, np.arcsin(np.clip(spread / np.maximum(near, 1e-9), 0, 1)) + 1e-9, 4.0)
+    low = bearing + np.minimum(arc, 0.0) - pad
+    width = np.minimum(np.abs(arc) + 2.0 * pad, 2.0 * np.pi)
+    low = angles[0] + np.mod(low - angles[0], 2.0 * np.pi)
+    low = np.concatenate([low, low - 2.0 * np.pi])  # the arc may pass the first ray's bearing
+    begin = np.searchsorted(angles, low, "left")
+    count = np.searchsorted(angles, low + np.tile(width, 2), "right") - begin
+    ends = np.cumsum(count)
+    ray = np.arange(ends[-1]) + np.repeat(begin - (ends - count), count)
+    return ray, np.repeat(np.tile(np.arange(len(segments)), 2), count)
+
+
+def blocked(segments: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Whether a segment crosses the straight line from start to end, both (n, 2) [m]; (n,) bool."""
+    a, along = segments[None, :, :2], segments[None, :, 2:] - segments[None, :, :2]
+    line = (end - start)[:, None]
+    to_a = a - start[:, None]
+    det = _cross(line, along)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t, u = _cross(to_a, along) / det, _cross(to_a, line) / det
+    return np.any((t > 0.0) & (t < 1.0) & (u >= 0.0) & (u <= 1.0), axis=1)
+
+
+def point_segment_distance(points: np.ndarray, segments: np.ndarray) -> np.ndarray:
+    """Distance of points (n, 2) from segments (S, 4), (n, S) [m]."""
+    a, along = segments[:, :2], segments[:, 2:] - segments[:, :2]
+    length2 = np.maximum(np.sum(along**2, -1), 1e-30)
+    share = np.clip(np.sum((points[:, None] - a) * along, -1) / length2, 0.0, 1.0)
+    return np.hypot(*np.moveaxis(points[:, None] - a - share[..., None] * along, -1, 0))
+
+
+def inside(outline: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Whether points (n, 2) lie in the polygon outline (V, 2) [m]; (n,) bool."""
+    return np.sum(_crossings(polygon(outline), points), axis=1) % 2 == 1
+
+
+def free(world: World, points: np.ndarray) -> np.ndarray:
+    """Whether points (n, 2) lie on the floor and in no furniture; for worlds of closed shapes. (n,) bool."""
+    return np.sum(_crossings(world.segments, points), axis=1) % 2 == 1
+
+
+def _crossings(segments: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Whether the ray from each point towards +x meets each segment, (n, S) bool."""
+    x1, y1, x2, y2 = segments.T
+    x, y = points[:, :1], points[:, 1:]
+    straddles = (y1 > y) != (y2 > y)
+    return straddles & (x < x1 + (y - y1) * (x2 - x1) / np.where(y1 == y2, 1.0, y2 - y1))
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """z of the cross product of (..., 2) vectors."""
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+# Building blocks -----------------------------------------------------------------------------------------------------
+
+
+def polygon(corners: np.ndarray) -> np.ndarray:
+    """Segments (V, 4) around the corners (V, 2) [m]."""
+    return np.hstack([corners, np.roll(corners, -1, axis=0)])
+
+
+def box(centre: Point, size: Point, angle: float = 0.0) -> np.ndarray:
+    """Corners (4, 2) of a box of a size (length, width) [m] turned by angle [rad]."""
+    half = 0.5 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.asarray(size)
+    return place((centre[0], centre[1], angle), half)
+
+
+def _ring(centre: np.ndarray, radius: float, corners: int = 8) -> np.ndarray:
+    """Corners (corners, 2) of a round column of a radius [m]."""
+    turn = 2.0 * np.pi * np.arange(corners) / corners
+    return centre + radius * np.stack([np.cos(turn), np.sin(turn)], -1)
+
+
+class _Floor:
+    """A floor being furnished: takes a shape only where it disturbs neither the route nor other shapes."""
+
+    def __init__(self, outline: np.ndarray, lap: np.ndarray):
+        self.outline, self.lap, self.shapes = outline, lap, []
+        route = [Track(lap, radius, closed=True).sample(0.2)[:, :2] for radius in (0.3, WIDEST_CORNER)]
+        self.route = np.concatenate(route)
+
+    def put(self, shape: np.ndarray, gap: float = 0.03) -> bool:
+        """Adds a shape (V, 2) [m] if it lies on the floor, `gap` [m] from all others; says whether it did."""
+        if np.min(np.hypot(*(self.route - shape.mean(0)).T)) < CLEARANCE:  # most are refused here, cheaply
+            return False
+        edges = polygon(shape)
+        marks = np.concatenate([edges[:, :2] + f * (edges[:, 2:] - edges[:, :2]) for f in np.linspace(0, 1, 9)])
+        others = np.concatenate([polygon(self.outline), *(polygon(s) for s in self.shapes)])
+        ok = np.all(inside(self.outline, marks))
+        ok = ok and point_segment_distance(self.route, edges).min() > CLEARANCE
+        ok = ok and point_segment_distance(marks, others).min() > gap
+        ok = ok and point_segment_distance(others[:, :2], edges).min() > gap
+        ok = ok and not any(inside(s, shape).any() or inside(shape, s).any() for s in self.shapes)
+        if ok:
+            self.shapes.append(shape)
+        return bool(ok)
+
+    def scatter(self, count: int, draw: Callable[[], np.ndarray], gap: float = 0.03) -> None:
+        """Adds up to `count` shapes from draw() -> (V, 2); gives up on a full floor."""
+        put = 0
+        for _ in range(40 * count):
+            put += self.put(draw(), gap)
+            if put == count:
+                return
+
+    def world(self, name: str) -> World:
+        segments = np.concatenate([polygon(self.outline), *(polygon(s) for s in self.shapes)])
+        return World(segments, name, self.lap, self.outline)
+
+
+def _wall_with_niches(rng: np.random.Generator, width: float, depth: float, share: float) -> np.ndarray:
+    """Corners (V, 2) of a room width x depth [m] with niches (outward) and pilasters (inward) along its walls.
+
+    share is the part of places along a wall that has one.
+    """
+    corners = np.array([[0.0, 0.0], [width, 0.0], [width, depth], [0.0, depth]])
+    outline = []
+    for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        length = float(np.hypot(*(end - start)))
+        along = (end - start) / length
+        outward = np.array([along[1], -along[0]])
+        outline.append(start)
+        at = rng.uniform(0.6, 1.6)
+        while at < length - 3.2:
+            span = rng.uniform(0.5, 2.4)
+            out = rng.uniform(0.15, 0.9) if rng.uniform() < 0.65 else -rng.uniform(0.12, 0.35)
+            if rng.uniform() < share:
+                for s, o in ((at, 0.0), (at, out), (at + span, out), (at + span, 0.0)):
+                    outline.append(start + s * along + o * outward)
+            at += span + rng.uniform(0.7, 2.2)
+    return np.array(outline)
+
+
+def _against_wall(rng: np.random.Generator, width: float, depth: float, size: tuple[float, float]) -> np.ndarray:
+    """Corners of a box of a size (length, width) [m] with its long side at a wall of the room width x depth."""
+    side = rng.integers(4)
+    gap = rng.uniform(0.04, 0.12) + 0.5 * size[1]
+    length = width if side % 2 == 0 else depth
+    at = rng.uniform(0.5 * size[0] + 0.1, length - 0.5 * size[0] - 0.1)
+    centre = [(at, gap), (width - gap, at), (at, depth - gap), (gap, at)][side]
+    return box(centre, size, 0.5 * np.pi * (side % 2))
+
+
+def _furnish(rng: np.random.Generator, floor: _Floor, width: float, depth: float, tilt: float) -> None:
+    """Benches and shelves along the walls, machines and pillars on the floor; tilt [rad] is how skew they stand."""
+
+    def anywhere(low: tuple[float, float], high: tuple[float, float]) -> np.ndarray:
+        centre = rng.uniform([0.6, 0.6], [width - 0.6, depth - 0.6])
+        return box(centre, rng.uniform(low, high), rng.normal(0.0, tilt))
+
+    grid = [(0.5 * width, 0.28 * depth), (0.5 * width, 0.5 * depth), (0.5 * width, 0.72 * depth)]
+    for centre in grid:  # the columns that carry the roof
+        if rng.uniform() < 0.7:
+            floor.put(box(np.array(centre) + rng.normal(0, 0.15, 2), (0.35, 0.35)))
+    floor.scatter(6, lambda: _against_wall(rng, width, depth, (rng.uniform(1.2, 2.4), rng.uniform(0.6, 0.8))))
+    floor.scatter(4, lambda: _against_wall(rng, width, depth, (rng.uniform(0.8, 1.4), rng.uniform(0.35, 0.5))))
+    floor.scatter(4, lambda: anywhere((0.8, 0.6), (2.0, 1.2)), gap=0.3)
+    floor.scatter(4, lambda: anywhere((0.25, 0.25), (0.7, 0.5)), gap=0.25)
+    floor.scatter(2, lambda: _ring(rng.uniform([0.6, 0.6], [width - 0.6, depth - 0.6]), rng.uniform(0.15, 0.3)), 0.25)
+
+
+# Worlds --------------------------------------------------------------------------------------------------------------
+
+
+def workshop(seed: int = 0) -> World:
+    """The 12 x 19 m workshop: benches and shelves along the walls, machines on the floor, a lap of 38.5 m between."""
+    rng = np.random.default_rng([seed, 12, 19])
+    width, depth = 12.0, 19.0
+    lap = np.array([[2.65, 2.7], [9.35, 2.7], [9.35, 16.3], [2.65, 16.3]])
+    floor = _Floor(_wall_with_niches(rng, width, depth, 0.35), lap)
+    _furnish(rng, floor, width, depth, tilt=0.05)
+    return floor.world("workshop")
+
+
+def hall(seed: int, size: tuple[float, float] | None = None) -> World:
+    """A random hall of 10-16 x 14-22 m (or of a given size [m]) with niches, furniture and a free lap."""
+    rng = np.random.default_rng([seed, 14, 22])
+    drawn = rng.uniform([10.0, 14.0], [16.0, 22.0])
+    width, depth = drawn if size is None else size
+    left, right, low, high = rng.uniform(2.2, 2.8, 4)
+    lap = np.array([[left, low], [width - right, low], [width - right, depth - high], [left, depth - high]])
+    if size is None:  # no right angles, and the long sides bend a little in the middle
+        middle = 0.5 * (lap[[1, 3]] + lap[[2, 0]]) + rng.uniform(-0.6, 0.6, (2, 1)) * np.array([1.0, 0.0])
+        lap += rng.uniform(-0.3, 0.3, (4, 2))
+        lap = np.array([lap[0], lap[1], middle[0], lap[2], lap[3], middle[1]])
+    floor = _Floor(_wall_with_niches(rng, width, depth, 0.6), lap)
+    _furnish(rng, floor, width, depth, tilt=0.4)
+    return floor.world("hall")
+
+
+def corridor(length: float = 22.7, width: float = 2.4, recesses: bool = False, seed: int = 0) -> World:
+    """A straight corridor [m], bare or with doors set back into its walls at irregular places."""
+    rng = np.random.default_rng([seed, 22, 7])
+    outline = [np.array([0.0, 0.0])]
+    for wall, direction in ((0.0, 1.0), (width, -1.0)):
+        along = []
+        at = rng.uniform(1.0, 2.5)
+        while recesses and at < length - 1.6:
+            span, deep = rng.uniform(0.8, 1.2), rng.uniform(0.1, 0.25)
+            along += [(at, 0.0), (at, deep), (at + span, deep), (at + span, 0.0)]
+            at += span + rng.uniform(0.8, 3.0)
+        for s, o in along:
+            outline.append(np.array([s if direction > 0 else length - s, wall - direction * o]))
+        outline.append(np.array([length if direction > 0 else 0.0, wall]))
+        if direction > 0:
+            outline.append(np.array([length, width]))
+    lap = np.array([[1.4, 0.5 * width], [length - 1.4, 0.5 * width]])
+    corners = np.array(outline)
+    return World(polygon(corners), "corridor", lap, corners)
+
+
+def office(seed: int = 0, size: tuple[float, float] = (60.0, 40.0), corridor_width: float = 2.2) -> World:
+    """An office floor [m]: rooms along the outside, a corridor all round, a core of rooms; some doors stand open."""
+    rng = np.random.default_rng([seed, 60, 40])
+    width, depth = size
+    outer = rng.uniform(4.6, 5.2)  # depth of the rooms along the facade
+    near, far = outer, outer + corridor_width
+    insets = (0.0, near, far, far + 4.5, 0.5 * (near + far))
+    facade, ring, core, back, lap = (box((0.5 * width, 0.5 * depth), (width - 2 * m, depth - 2 * m)) for m in insets)
+    segments = [polygon(facade), polygon(back)]
+    for corners, inward in ((ring, -1.0), (core, 1.0)):
+        room = near if inward < 0 else 4.5
+        for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+            segments.append(_rooms(rng, start, end, inward * room))
+    return World(np.concatenate(segments), "office", lap, facade)
+
+
+def _rooms(rng: np.random.Generator, start: np.ndarray, end: np.ndarray, deep: float) -> np.ndarray:
+    """One corridor wall from start to end (2,) with a row of rooms `deep` [m] behind it (left of it if > 0), (n, 4)."""
+    length = float(np.hypot(*(end - start)))
+    along = (end - start) / length
+    across = np.array([-along[1], along[0]])
+    side, lines = np.sign(deep), []
+
+    def line(*points: tuple[float, float]) -> None:
+        world = [start + s * along + o * across for s, o in points]
+        lines.extend(np.concatenate(pair) for pair in pairwise(world))
+
+    at = 0.0
+    while at < length - 1e-9:
+        span = rng.uniform(2.8, 6.0)
+        span = length - at if length - at - span < 2.8 else span
+        door = at + rng.uniform(0.4, span - 1.4)
+        recess = side * rng.uniform(0.06, 0.2)
+        line((at, 0.0), (door, 0.0), (door, recess))
+        line((door + 0.9, recess), (door + 0.9, 0.0), (at + span, 0.0))
+        if rng.uniform() < 0.4:  # open: the leaf stands in the room, which is seen through the gap
+            line((door, recess), (door + 0.15, recess + side * 0.88))
+            desk = box((at + 0.5 * span, 0.7 * deep), rng.uniform([1.2, 0.6], [1.8, 0.9]), rng.normal(0, 0.1))
+            lines.extend(polygon(place((*start, np.arctan2(along[1], along[0])), desk)))
+        else:
+            line((door, recess), (door + 0.9, recess))
+        at += span
+        if at < length - 1e-9:
+            line((at, 0.0), (at, deep))
+    return np.array(lines)
