@@ -168,17 +168,15 @@ def test_walls_lengthen_only_what_they_block() -> None:
     blocked, clear = ranges_of(blocked_made), ranges_of(clear_made)
     excess = np.array([b.range - c.range for b, c in zip(blocked, clear, strict=True)])
     beacons = {b.id: b.position for b in blocked_made.beacons}
-    wall = []
-    for m in blocked:  # by casting a ray from one end: another algorithm than the crossing test
+    assert np.all(excess >= 0.0)
+    wall = excess > 0.0
+    for m, seen in list(zip(blocked, wall, strict=True))[::31]:  # by a ray from one end instead of the crossing test
         x, y, _ = blocked_made.path.pose(seconds([m.stamp]))[0]
         ends = [np.array(beacons.get(n, (x, y))) for n in (m.source, m.target)]
         to = ends[1] - ends[0]
         hit = worlds.cast(blocked_made.world.segments, ends[0], np.array([np.arctan2(to[1], to[0])]))
-        wall.append(hit[0] < np.hypot(*to))
-    wall = np.array(wall)
+        assert seen == (hit[0] < np.hypot(*to))
     assert 0.05 < wall.mean() < 0.9
-    assert np.all(excess[~wall] == 0.0)
-    assert np.all(excess[wall] > 0.0)
     assert abs(excess[wall].mean() - 0.8) < 4 * 0.8 / np.sqrt(wall.sum())  # an exponential's std is its mean
     gap = np.array([m.receive_power - m.first_path_power for m in blocked])
     assert abs(np.mean(gap[wall] > 10.0) - 0.95) < 4 * np.sqrt(0.95 * 0.05 / wall.sum())
@@ -217,9 +215,9 @@ def test_early_locks_hit_one_beacon_in_its_stretches() -> None:
 def test_special_radios() -> None:
     assert all(np.isnan(m.receive_power) for m in ranges_of(scenario("nlos_silent", 1, 2.0)))
     assert all(m.source == 0 for m in ranges_of(scenario("robot_only", 1, 2.0)))
-    t = seconds([m.stamp for m in ranges_of(ready("uwb_silent", 1))])
+    t = seconds([m.stamp for m in ranges_of(scenario("uwb_silent", 1, 92.0))])
     assert not np.any((t >= 60.0) & (t < 90.0))
-    assert t.max() > 149.0
+    assert t.max() > 91.0
     biased = scenario("biased", 1, duration_s=30.0)
     messages = ranges_of(biased)
     error = np.array([m.range for m in messages]) - true_distances(biased, messages)
@@ -365,14 +363,14 @@ def test_kidnapped_is_turned_by_120_degrees_within_a_second() -> None:
 
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_stamps_rise_on_each_topic(name: str) -> None:
-    made = scenario(name, 2, duration_s=2.5)
+    made = replace(ready(name, 1), duration=1.5)
     stamps = defaultdict(list)
     for m in simulate(made):
         stamps[(type(m), m.node if isinstance(m, TruthMessage) else None)].append(m.stamp)
     assert all(type(s) is int for series in stamps.values() for s in series)
     assert all(np.all(np.diff(series) > 0) for series in stamps.values())
     assert stamps[(ScanMessage, None)] == stamps[(TruthMessage, None)]
-    assert all(series[0] >= START_NS and series[-1] < START_NS + 2_500_000_000 for series in stamps.values())
+    assert all(series[0] >= START_NS and series[-1] < START_NS + 1_500_000_000 for series in stamps.values())
     assert ((OdometryMessage, None) in stamps) == (name == "slow_lidar")
     for beacon in made.beacons:
         if beacon.alive[0][0] == 0.0:
@@ -400,7 +398,7 @@ def test_truth_follows_the_path() -> None:
 
 
 def test_odometry_drifts_by_its_scale() -> None:
-    made = ready("slow_lidar", 1)
+    made = scenario("slow_lidar", 1, duration_s=90.0)
     odometry = [m for m in simulate(made) if isinstance(m, OdometryMessage)]
     xy = np.array([(m.x, m.y) for m in odometry])
     driven = np.hypot(*np.diff(xy, axis=0).T).sum()

@@ -48,11 +48,18 @@ def spread(world: World, route: np.ndarray, count: int, rng: np.random.Generator
         to_route = np.min(np.hypot(*np.moveaxis(spots[:, None] - route[None, :, :2], -1, 0)), axis=1)
         chosen: list[np.ndarray] = []
         for spot in spots[to_route > 0.5]:
-            if all(np.hypot(*(spot - other)) > apart for other in chosen):
+            if len(chosen) < count and all(np.hypot(*(spot - other)) > apart for other in chosen):
                 chosen.append(spot)
-            if len(chosen) == count:
-                return np.array(chosen)
-        apart *= 0.9  # a small or crowded floor
+        if len(chosen) == count and _off_line(np.array(chosen)) > 1.0:
+            return np.array(chosen)
+        apart *= 0.97  # a small or crowded floor
+
+
+def _off_line(spots: np.ndarray) -> float:
+    """How far places (n, 2) are from lying on one line, rms [m]; beacons on a line leave the side open for good."""
+    if len(spots) < 3:
+        return INF
+    return float(np.linalg.svd(spots - spots.mean(0), compute_uv=False)[1] / np.sqrt(len(spots)))
 
 
 def _beacons(world: World, track: Track, seed: int, ids: Sequence[int], height: float = 0.0) -> tuple[Beacon, ...]:
@@ -114,7 +121,7 @@ def _spot_turns(seed: int, duration: float | None) -> Scenario:
     rng = stream(seed, "stops")
     pieces: list[Piece] = [Rest(4.0)]
     s = 0.0
-    while len(pieces) == 1 or Path(pieces).duration < made.duration:
+    while len(pieces) == 1 or sum(p.duration for p in pieces) < made.duration:
         s_next = s + rng.uniform(3.0, 7.0)
         pieces.append(Along(track, s, s_next))
         s = s_next

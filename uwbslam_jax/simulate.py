@@ -184,7 +184,7 @@ def _range_errors(
     t: np.ndarray,
     wall: np.ndarray,
 ) -> np.ndarray:
-    """Noise, biases and faults of exchanges between two ids (n,) at times t (n,) [s], through a wall or not; (n,) [m]."""
+    """Noise, bias and faults (n,) [m] of exchanges between two ids (n,) at times t (n,) [s], behind a wall or not."""
     nlos, outlier, early = (draws[d].uniform(size=(t.size, 2)).T for d in ("nlos", "outlier", "early"))
     error = uwb.sigma * draws["noise"].normal(size=t.size)
     for node, bias in uwb.bias.items():

@@ -123,20 +123,21 @@ def point_segment_distance(points: np.ndarray, segments: np.ndarray) -> np.ndarr
 
 def inside(outline: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Whether points (n, 2) lie in the polygon outline (V, 2) [m]; (n,) bool."""
-    return np.sum(_crossings(polygon(outline), points), axis=1) % 2 == 1
+    return _enclosed(polygon(outline), points)
 
 
 def free(world: World, points: np.ndarray) -> np.ndarray:
     """Whether points (n, 2) lie on the floor and in no furniture; for worlds of closed shapes. (n,) bool."""
-    return np.sum(_crossings(world.segments, points), axis=1) % 2 == 1
+    return _enclosed(world.segments, points)
 
 
-def _crossings(segments: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Whether the ray from each point towards +x meets each segment, (n, S) bool."""
+def _enclosed(segments: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Whether the ray from each point (n, 2) towards +x meets an odd number of segments (S, 4), (n,) bool."""
     x1, y1, x2, y2 = segments.T
     x, y = points[:, :1], points[:, 1:]
     straddles = (y1 > y) != (y2 > y)
-    return straddles & (x < x1 + (y - y1) * (x2 - x1) / np.where(y1 == y2, 1.0, y2 - y1))
+    crossed = straddles & (x < x1 + (y - y1) * (x2 - x1) / np.where(y1 == y2, 1.0, y2 - y1))
+    return np.sum(crossed, axis=1) % 2 == 1
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -168,7 +169,7 @@ class _Floor:
     """A floor being furnished: takes a shape only where it disturbs neither the route nor other shapes."""
 
     def __init__(self, outline: np.ndarray, lap: np.ndarray):
-        self.outline, self.lap, self.shapes = outline, lap, []
+        self.outline, self.lap, self.segments = outline, lap, polygon(outline)
         route = [Track(lap, radius, closed=True).sample(0.2)[:, :2] for radius in (0.3, WIDEST_CORNER)]
         self.route = np.concatenate(route)
 
@@ -176,16 +177,14 @@ class _Floor:
         """Adds a shape (V, 2) [m] if it lies on the floor, `gap` [m] from all others; says whether it did."""
         if np.min(np.hypot(*(self.route - shape.mean(0)).T)) < CLEARANCE:  # most are refused here, cheaply
             return False
-        edges = polygon(shape)
+        edges, corners = polygon(shape), self.segments[:, :2]
         marks = np.concatenate([edges[:, :2] + f * (edges[:, 2:] - edges[:, :2]) for f in np.linspace(0, 1, 9)])
-        others = np.concatenate([polygon(self.outline), *(polygon(s) for s in self.shapes)])
-        ok = np.all(inside(self.outline, marks))
+        ok = np.all(_enclosed(self.segments, marks)) and not np.any(inside(shape, corners))
         ok = ok and point_segment_distance(self.route, edges).min() > CLEARANCE
-        ok = ok and point_segment_distance(marks, others).min() > gap
-        ok = ok and point_segment_distance(others[:, :2], edges).min() > gap
-        ok = ok and not any(inside(s, shape).any() or inside(shape, s).any() for s in self.shapes)
+        ok = ok and point_segment_distance(marks, self.segments).min() > gap
+        ok = ok and point_segment_distance(corners, edges).min() > gap
         if ok:
-            self.shapes.append(shape)
+            self.segments = np.concatenate([self.segments, edges])
         return bool(ok)
 
     def scatter(self, count: int, draw: Callable[[], np.ndarray], gap: float = 0.03) -> None:
@@ -197,8 +196,7 @@ class _Floor:
                 return
 
     def world(self, name: str) -> World:
-        segments = np.concatenate([polygon(self.outline), *(polygon(s) for s in self.shapes)])
-        return World(segments, name, self.lap, self.outline)
+        return World(self.segments, name, self.lap, self.outline)
 
 
 def _wall_with_niches(rng: np.random.Generator, width: float, depth: float, share: float) -> np.ndarray:
