@@ -203,7 +203,7 @@ class Settings:
 def make_config(settings: Settings) -> Config:
     """The static part of the settings."""
     nodes = 1 + settings.uwb.max_beacons
-    block = 64  # finest cells in a window stay divisible by every level and by the tiles kept outside it
+    block = 128  # half a window is a whole number of the tiles that are kept outside it
     cells = block * round(settings.map.size_m / settings.map.resolution / block)
     return Config(
         nodes=nodes,

@@ -92,12 +92,13 @@ def inspect(
                 problems.append(f"no {role} topic")
         except LogError as error:
             problems.append(str(error))
-    clocks = {topic: _Clock() for topic in {channel.topic for channel in recording.channels.values()}}
+    topic_of = {channel.id: channel.topic for channel in recording.channels.values()}
+    clocks = {topic: _Clock() for topic in topic_of.values()}
     heard = _Heard()
     for log_time, number, data in recording.records():
-        if number not in recording.channels:
+        if number not in topic_of:
             continue
-        clocks[recording.channels[number].topic].tick(log_time)
+        clocks[topic_of[number]].tick(log_time)
         if number in decoders:
             heard.take(decoders[number](data, log_time))
     return LogSummary(

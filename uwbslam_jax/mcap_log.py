@@ -32,7 +32,7 @@ class LogReader:
       warnings: what a user should know before the run, one line each.
       dropped: messages left out so far, by reason; of the current iteration.
       truncated: where the recording breaks, None where it does not; a corrupt chunk shows only while iterating.
-      message_count: messages on the topics used, for a progress bar; None where the file does not say.
+      message_count: messages on the topics used, whole and not yet decoded; for a progress bar.
       duration: from the first to the last message of the file [s].
     """
 
@@ -67,7 +67,7 @@ class LogReader:
                 raise LogError(f"no scan topic ({scan_topic} or any LaserScan); {_listing(self._recording)}")
         except LogError as error:
             broken = f"; {self._recording.truncated}" if self._recording.truncated else ""
-            raise LogError(f"{self.path}: {error}{broken}") from None
+            raise LogError(f"{self.path}: {' '.join(str(error).split())}{broken}") from None
         channels = self._recording.channels
         self.topics: dict[str, Role] = {channels[number].topic: role for number, role in self._roles.items()}
         self.warnings: list[str] = []
@@ -75,7 +75,7 @@ class LogReader:
             self.warnings.append("no UWB topic: LiDAR only")
         self.duration = (self._recording.end - self._recording.start) * 1e-9
         counts = self._recording.counts
-        self.message_count: int | None = sum(counts[number] for number in self._roles) if counts else None
+        self.message_count = sum(counts[number] for number in self._roles)
 
     @property
     def dropped(self) -> Counter[str]:

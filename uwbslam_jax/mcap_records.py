@@ -32,7 +32,7 @@ PLAIN_BLOCK_BYTES = 1 << 20  # unchunked messages are read this many bytes at a 
 MAX_CHUNK_BYTES = 1 << 30  # a chunk that claims more is taken as corrupt rather than allocated
 _HEADER = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<BQHIQQ")  # record header, channel, sequence, log time, publish time
-_CHUNK = struct.Struct("<QQQI")
+_CHUNK = struct.Struct("<QQQII")  # first and last log time, size, crc, length of the compression's name
 
 
 class LogError(ValueError):
@@ -45,11 +45,9 @@ class _CorruptError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """One topic of a recording and how its messages are encoded.
+    """One topic of a recording, its number in the file, and how its messages are encoded.
 
     Attributes:
-      id: number in the file.
-      topic: its name.
       encoding: of the messages ("cdr", "ros1", "json", "protobuf").
       schema: name of the message type, "" where the file names none.
       schema_encoding: language of the definition ("ros2msg", "ros2idl", "ros1msg", ...).
@@ -180,7 +178,7 @@ class Recording:
             if opcode == Opcode.CHUNK:
                 block = self._chunk_at(file, position)
                 blocks += [block] if block else []
-                if block is None or not block.whole:
+                if block is None or not block.whole or end > self.size:
                     return blocks, position
             elif opcode == 0 or end > self.size:  # 0 is no opcode: a file that was allocated and never written
                 return blocks, position
@@ -197,14 +195,11 @@ class Recording:
     def _chunk_at(self, file: BinaryIO, position: int) -> _Block | None:
         """The chunk record at this byte, None where not even its head is whole."""
         file.seek(position)
-        head = file.read(_HEADER.size + _CHUNK.size + 4)
-        if len(head) < _HEADER.size + _CHUNK.size + 4:
+        head = file.read(_HEADER.size + _CHUNK.size)
+        if len(head) < _HEADER.size + _CHUNK.size:
             return None
-        start, _, size, crc = _CHUNK.unpack_from(head, _HEADER.size)
-        (name_length,) = struct.unpack_from("<I", head, _HEADER.size + _CHUNK.size)
-        if name_length > 64:  # "zstd" or "lz4": anything long is noise
-            return None
-        tail = file.read(name_length + 8)
+        start, _, size, crc, name_length = _CHUNK.unpack_from(head, _HEADER.size)
+        tail = file.read(name_length + 8) if name_length <= 64 else b""  # "zstd" or "lz4": anything long is noise
         if len(tail) < name_length + 8:
             return None
         (length,) = struct.unpack_from("<Q", tail, name_length)
@@ -215,11 +210,13 @@ class Recording:
 
     def _take_stock(self, file: BinaryIO, broken_at: int | None) -> None:
         """Channels, counts and times: from the summary, or by reading through where there is none."""
-        statistics = self._statistics
-        if broken_at is None and statistics is not None and statistics.channel_count <= len(self.channels):
-            self.counts.update(statistics.channel_message_counts)
-            self.start, self.end = statistics.message_start_time, statistics.message_end_time
+        told = self._statistics
+        if broken_at is None and told and told.channel_count <= len(self.channels):
+            self.counts.update(told.channel_message_counts)
+        if told and self.counts.total() == told.message_count:
+            self.start, self.end = told.message_start_time, told.message_end_time
         else:
+            self.counts.clear()
             for index, block in enumerate(self._blocks):
                 try:
                     messages = self._messages(self._content(file, block), None)
@@ -228,9 +225,9 @@ class Recording:
                     self._break(block.record, self.end, str(error))
                     break
                 self.counts.update(message.channel for message in messages)
-                for time in (m.log_time for m in messages):
-                    self.start = min(self.start or time, time)
-                    self.end = max(self.end, time)
+                times = [message.log_time for message in messages]
+                self.start = min([self.start or times[0], *times]) if times else self.start
+                self.end = max([self.end, *times])
         if broken_at is not None and self.truncated is None:
             self._break(broken_at, self.end, "")
         self._blocks.sort(key=attrgetter("start"))
@@ -275,7 +272,7 @@ class Recording:
         return found
 
     def _learn(self, opcode: int, content: bytes) -> None:
-        """Takes in a schema, channel or statistics record; one that does not parse is left out."""
+        """Takes in a schema, channel or statistics record; what does not parse or lacks its schema is left out."""
         stream = ReadDataStream(io.BytesIO(content))
         try:
             if opcode == Opcode.SCHEMA:
@@ -286,8 +283,10 @@ class Recording:
             else:
                 channel = mcap_record_types.Channel.read(stream)
                 schema = self._schemas.get(channel.schema_id)
-                about = (schema.name, schema.encoding, schema.data) if schema else ("", "", b"")
-                self.channels[channel.id] = Channel(channel.id, channel.topic, channel.message_encoding, *about)
+                if schema or channel.schema_id == 0:
+                    about = (schema.name, schema.encoding, schema.data) if schema else ("", "", b"")
+                    found = Channel(channel.id, channel.topic, channel.message_encoding, *about)
+                    self.channels.setdefault(found.id, found)
         except (McapError, struct.error, ValueError):
             pass
 

@@ -174,10 +174,11 @@ def _fast_range(options: Options) -> Decoder:
                 raise ValueError("not plain CDR")
             sec, nanosec, length = heads[data[1]].unpack_from(data, 4)
             source, target, *values = tails[data[1]].unpack_from(data, 16 + (length + 3 & ~3))
+            stamp = sec * 1_000_000_000 + nanosec or log_time
         except (struct.error, IndexError, ValueError):
             options.dropped["range: malformed"] += 1
             return []
-        return _ranges(sec * 1_000_000_000 + nanosec or log_time, source, target, values[0], values[1], values[2], options)
+        return _ranges(stamp, source, target, values[0], values[1], values[2], options)
 
     return decode
 

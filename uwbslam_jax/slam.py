@@ -224,11 +224,11 @@ def _draw(config, state, match, sweep, trusted):
 
 
 def _novelty(config, grid, sweep, pose):
-    """Share of the returns that end where the coarsest level has no wall yet."""
+    """Share of the returns that end where the coarsest level has no wall yet in any of the four cells around."""
     k = len(grid.levels) - 1
     ends = transform_points(pose, sweep.points)
-    gamma = occupancy.lookup(grid, ends, config.resolution, k)
-    new = sweep.valid & (gamma < 0.55)
+    corners, _, inside = occupancy.corner_log_odds(grid.levels[k], grid.origin, config.resolution * 2**k, ends)
+    new = sweep.valid & inside & jnp.all(corners <= 0, axis=(1, 2))
     return jnp.sum(new) / jnp.maximum(jnp.sum(sweep.valid), 1)
 
 

@@ -1,0 +1,526 @@
+"""A run as one HTML page that opens offline: figures, map with a player, charts and tables.
+
+The page's looks are in report.html, its map and charts in report.js; here its data and tables are written.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import re
+import struct
+import zlib
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from datetime import UTC, datetime
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from uwbslam_jax import __version__
+from uwbslam_jax.result import BeaconEstimate, MapImage, Result
+
+# Embedded at most: what a screen can show and a file of a few megabytes holds.
+_POSES, _SAMPLES, _RESIDUALS, _PAIRS, _PIXELS = 6000, 2000, 12_000, 60, 2000
+
+# name -> label, unit, digits. What is not listed is shown all the same, under its own name.
+_FIGURES: dict[str, tuple[str, str, int]] = {
+    "steps": ("Steps", "", 0),
+    "duration_s": ("Duration", "s", 1),
+    "wall_s": ("Wall time", "s", 2),
+    "compile_s": ("Compilation", "s", 2),
+    "step_ms_median": ("Step time, median", "ms", 2),
+    "step_ms_p95": ("Step time, 95 %", "ms", 2),
+    "real_time_factor": ("Real-time factor", "×", 1),
+    "peak_rss_mb": ("Peak memory", "MB", 0),
+    "robot_rmse_m": ("Robot, RMS", "m", 3),
+    "robot_ate_m": ("Robot, ATE (aligned alone)", "m", 3),
+    "robot_max_m": ("Robot, largest", "m", 3),
+    "heading_deg_median": ("Heading, median", "°", 2),
+    "heading_deg_p95": ("Heading, 95 %", "°", 2),
+    "beacon_mean_m": ("Beacons, mean", "m", 3),
+    "beacon_max_m": ("Beacons, largest", "m", 3),
+    "covered": ("Share of the time covered", "", 3),
+    "beacons_missing": ("Beacons missing", "", 0),
+    "pose_nees": ("Pose NEES", "", 2),
+    "pose_nees_ratio": ("Pose NEES / dof", "", 2),
+    "beacon_nees": ("Beacon NEES", "", 2),
+    "beacon_nees_ratio": ("Beacon NEES / dof", "", 2),
+}
+# name -> label, unit; the order is that on the page.
+_DIAGNOSTICS: dict[str, tuple[str, str]] = {
+    "match_score": ("Match score", ""),
+    "score": ("Match score", ""),
+    "step_ms": ("Step time", "ms"),
+    "hypotheses": ("Hypotheses", ""),
+    "ranges_used": ("Ranges used", "a frame"),
+    "searched": ("Wide searches", ""),
+    "searches": ("Wide searches", ""),
+}
+_SHOWN_APART = {"config", "warnings", "events", "dropped"}
+
+
+def write_report(
+    result: Result, path: Path | str, metrics: Mapping[str, Any] | None = None, title: str = "UWB and LiDAR SLAM run"
+) -> None:
+    """Writes the page.
+
+    Args:
+      metrics: errors against the truth where there is one, see metrics.evaluate.
+      title: heading of the page, plain text.
+
+    Shown from result.summary besides plain figures: `warnings` (a list of lines), `truncated` (a line or a flag),
+    `dropped` (reason -> count), `config` (TOML text or nested tables), and a key with "decided" in its name, None
+    where the frame never was.
+
+    Raises:
+      OSError: the file cannot be written.
+    """
+    folder = files("uwbslam_jax")
+    parts = {
+        "title": html.escape(title),
+        "subtitle": _subtitle(result),
+        "notices": "".join(
+            f'<div class="notice {kind}">{"<b>Warning:</b> " if kind == "warn" else ""}{html.escape(text)}</div>'
+            for kind, text in _notices(result, metrics)
+        ),
+        "tiles": _tiles(result, metrics),
+        "legend": _legend(result.beacons),
+        "sections": _sections(result, metrics),
+        "footer": f"uwbslam_jax {html.escape(__version__)}",
+        # A closing tag inside a text would end the script element; the escape means the same to JSON.
+        "data": json.dumps(_data(result), separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
+        "script": folder.joinpath("report.js").read_text(encoding="utf-8"),
+    }
+    template = folder.joinpath("report.html").read_text(encoding="utf-8")
+    # In one pass, so that a text which looks like a placeholder stays a text.
+    page = re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], template)
+    Path(path).write_text(page, encoding="utf-8")
+
+
+# The words: headline, notices, tables.
+
+
+def _subtitle(result: Result) -> str:
+    if not len(result.stamps):
+        return "No scan was processed."
+    begin = datetime.fromtimestamp(int(result.stamps[0]) / 1e9, UTC)
+    when = f"{begin:%Y-%m-%d %H:%M:%S} UTC · " if begin.year > 2000 else ""
+    return f"{when}{_span(result):.1f} s · {len(result.stamps)} frames · {_driven(result):.1f} m driven"
+
+
+def _span(result: Result) -> float:
+    """Time from the first to the last frame [s]."""
+    return float(result.stamps[-1] - result.stamps[0]) / 1e9 if len(result.stamps) else 0.0
+
+
+def _driven(result: Result) -> float:
+    """Length of the track [m]; moves under 2 cm are summed up first, so that jitter at rest is not driving."""
+    total, last = 0.0, None
+    for xy in result.poses[np.isfinite(result.poses).all(axis=1), :2]:
+        if last is None:
+            last = xy
+        elif (step := float(np.hypot(*(xy - last)))) > 0.02:
+            total, last = total + step, xy
+    return total
+
+
+def _decided(result: Result) -> tuple[bool, Any]:
+    """Whether the frame was ever decided, and what the summary tells of when."""
+    told = [value for key, value in result.summary.items() if "decided" in key]
+    return (told[0] is not None and told[0] is not False if told else bool(np.isfinite(result.poses).any())), (
+        told[0] if told else None
+    )
+
+
+def _notices(result: Result, metrics: Mapping[str, Any] | None) -> Iterator[tuple[str, str]]:
+    """What a reader must know before any figure: ("warn" or "info", text)."""
+    summary = result.summary
+    if not _decided(result)[0]:
+        yield (
+            "warn",
+            "The frame was not decided. Poses, beacons and map are not in a known frame: most often the "
+            "robot did not move or turn enough, or too few ranges were heard.",
+        )
+    if not result.beacons:
+        yield "warn", "No beacon was placed."
+    if summary.get("truncated"):
+        told = summary["truncated"]
+        yield "warn", told if isinstance(told, str) else "The recording breaks off; it was used up to there."
+    for text in summary.get("warnings") or []:
+        yield "warn", str(text)
+    frames = np.diff(result.stamps) / 1e6
+    p95 = summary.get("step_ms_p95")
+    if len(frames) and isinstance(p95, int | float) and p95 > np.median(frames):
+        yield "warn", f"Slower than real time: a step takes {p95:.1f} ms (95 %), a frame {np.median(frames):.1f} ms."
+    for status in ("moving", "silent", "dropped"):
+        ids = [str(beacon.id) for beacon in result.beacons if beacon.status == status]
+        if ids:
+            yield "info", f"{'Beacon' if len(ids) == 1 else 'Beacons'} {', '.join(ids)} {status} at the end."
+    if metrics and metrics.get("beacons_missing"):
+        yield "warn", f"Not placed although the truth has them: beacons {_text(metrics['beacons_missing'])}."
+
+
+def _tiles(result: Result, metrics: Mapping[str, Any] | None) -> str:
+    """The headline figures."""
+    decided, when = _decided(result)
+    at = f"{when:.1f} s" if isinstance(when, int | float) and not isinstance(when, bool) else "yes"
+    states = Counter(beacon.status for beacon in result.beacons)
+    summary = {**dict.fromkeys(_FIGURES), **result.summary}
+    tiles = []
+    if metrics is not None:
+        m = {**dict.fromkeys(_FIGURES), **metrics}
+        tiles += [
+            ("Robot error, RMS", _figure(m["robot_rmse_m"], "m", 3), f"largest {_figure(m['robot_max_m'], 'm', 3)}"),
+            (
+                "Heading error, median",
+                _figure(m["heading_deg_median"], "°", 2),
+                f"95 % {_figure(m['heading_deg_p95'], '°', 2)}",
+            ),
+            (
+                "Beacon error, mean",
+                _figure(m["beacon_mean_m"], "m", 3),
+                f"largest {_figure(m['beacon_max_m'], 'm', 3)}",
+            ),
+        ]
+    tiles += [
+        ("Beacons placed", str(len(result.beacons)), ", ".join(f"{n} {html.escape(s)}" for s, n in states.items())),
+        ("Frame decided", html.escape(at) if decided else "not decided", "after the first scan" if at != "yes" else ""),
+        ("Driven", _figure(_driven(result), "m", 1), f"in {_figure(_span(result), 's', 1)}"),
+        (
+            "Step time, median",
+            _figure(summary["step_ms_median"], "ms", 2),
+            f"95 % {_figure(summary['step_ms_p95'], 'ms', 2)}",
+        ),
+        ("Real-time factor", _figure(summary["real_time_factor"], "×", 1), "recorded time over computing time"),
+    ]
+    return "".join(
+        f'<div class="tile"><div class="name">{name}</div><div class="value">{value}</div>'
+        f'<div class="note">{note}</div></div>'
+        for name, value, note in tiles
+    )
+
+
+def _figure(value: Any, unit: str, digits: int) -> str:
+    """A number with its unit, small, as HTML; a dash where there is none."""
+    if not isinstance(value, int | float | np.number) or not np.isfinite(value):
+        return "–"
+    space = "" if unit in ("°", "×") else " "
+    return f"{value:.{digits}f}{space}<small>{html.escape(unit)}</small>"
+
+
+def _text(value: Any) -> str:
+    """Any value of a summary as plain text."""
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    if value is None:
+        return "–"
+    if isinstance(value, float | np.floating):
+        return f"{value:.5g}" if np.isfinite(value) else "–"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key}: {_text(item)}" for key, item in value.items()) or "none"
+    if isinstance(value, list | tuple | np.ndarray):
+        return ", ".join(map(_text, value)) or "none"
+    return str(value)
+
+
+def _label(name: str, value: Any) -> tuple[str, str]:
+    """Name and value of a figure as plain text."""
+    label, unit, digits = _FIGURES.get(name, (name.replace("_", " "), "", -1))
+    if digits >= 0 and isinstance(value, int | float) and not isinstance(value, bool) and np.isfinite(value):
+        return label, f"{value:.{digits}f} {unit}".rstrip()
+    return label, _text(value)
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]], numeric: Sequence[int] = ()) -> str:
+    """A table of plain texts; the numeric columns are set to the right."""
+
+    def line(tag: str, cells: Sequence[str]) -> str:
+        kinds = [' class="n"' if k in numeric else ' class="text"' for k in range(len(cells))]
+        inner = "".join(f"<{tag}{kind}>{html.escape(cell)}</{tag}>" for kind, cell in zip(kinds, cells, strict=True))
+        return f"<tr>{inner}</tr>"
+
+    header = f"<thead>{line('th', head)}</thead>" if head else ""
+    return f'<div class="scroll"><table>{header}<tbody>{"".join(line("td", row) for row in rows)}</tbody></table></div>'
+
+
+def _section(title: str, body: str) -> str:
+    return f"<section><h2>{html.escape(title)}</h2>{body}</section>"
+
+
+def _legend(beacons: Sequence[BeaconEstimate]) -> str:
+    present = [s for s in ("static", "moving", "silent", "dropped") if any(b.status == s for b in beacons)]
+    return "".join(f'<span><i style="background: var(--{s})"></i>beacon, {s}</span>' for s in present)
+
+
+def _sections(result: Result, metrics: Mapping[str, Any] | None) -> str:
+    """Everything below the map."""
+    summary = result.summary
+    start = int(result.stamps[0]) if len(result.stamps) else 0
+    events = [(f"{(stamp - start) / 1e9:.2f}", text) for stamp, text in result.events]
+    dropped = summary.get("dropped") or {}
+    plain = [_label(key, value) for key, value in summary.items() if key not in _SHOWN_APART]
+    pairs = []
+    if metrics is not None:
+        evaluation = [_label(key, value) for key, value in metrics.items()]
+        pairs.append(_section("Errors against the truth", _table((), evaluation, [1])))
+    pairs.append(_section("Run", _table((), plain, [1]) if plain else '<p class="sub">No summary.</p>'))
+    counts = [(str(reason).replace("_", " "), _text(count)) for reason, count in dropped.items()]
+    pairs.append(_section("Dropped measurements", _table((), counts, [1]) if counts else '<p class="sub">None.</p>'))
+    settings = summary.get("config")
+    text = settings if isinstance(settings, str) else _nested(settings or {})
+    return "".join(
+        [
+            _section("Beacons", _beacon_table(result.beacons)),
+            _chart_section(result),
+            _residual_section(result),
+            _section(
+                "Events",
+                f'<div class="tall">{_table(("Time [s]", "What happened"), events, [0])}</div>'
+                if events
+                else '<p class="sub">None.</p>',
+            ),
+            f'<div class="two">{"".join(pairs)}</div>',
+            f"<section><details><summary>Configuration</summary><pre>{html.escape(text)}</pre></details></section>"
+            if text
+            else "",
+        ]
+    )
+
+
+def _nested(table: Mapping[str, Any], indent: str = "") -> str:
+    """Nested tables as lines of key = value."""
+    lines = []
+    for key, value in table.items():
+        if isinstance(value, Mapping) and value:
+            lines += [f"{indent}[{key}]", _nested(value, indent + "  ")]
+        else:
+            lines.append(f"{indent}{key} = {_text(value)}")
+    return "\n".join(lines)
+
+
+def _beacon_table(beacons: Sequence[BeaconEstimate]) -> str:
+    if not beacons:
+        return '<p class="sub">No beacon was placed.</p>'
+    rows = []
+    for b in sorted(beacons, key=lambda b: b.id):
+        sigma = np.sqrt(np.maximum(np.diagonal(b.cov), 0))
+        numbers = [*(f"{v:.3f}" for v in b.position), *(f"{v:.4f}" for v in sigma)]
+        cells = "".join(f'<td class="n">{"–" if v == "nan" else v}</td>' for v in numbers)
+        kind = re.sub(r"\W", "", b.status)
+        status = html.escape(b.status)
+        rows.append(f'<tr><td class="n">{b.id}</td>{cells}<td class="status {kind}">{status}</td></tr>')
+    head = "".join(f'<th class="n">{name}</th>' for name in ("Id", "x [m]", "y [m]", "σ x [m]", "σ y [m]"))
+    return f'<div class="scroll"><table><thead><tr>{head}<th>Status</th></tr></thead>{"".join(rows)}</table></div>'
+
+
+def _chart_section(result: Result) -> str:
+    shown = _diagnostics(result)
+    if not shown:
+        return ""
+    boxes = "".join(
+        f'<div><div class="head"><h3>{html.escape(s["name"])} <span>{html.escape(s["unit"])}</span></h3>'
+        f'<output></output></div><div data-chart="{k}"></div></div>'
+        for k, s in enumerate(shown)
+    )
+    return _section("Over time", f'<div class="charts">{boxes}</div>')
+
+
+def _residual_section(result: Result) -> str:
+    """Chart of the residuals, and a table of each pair's."""
+    statistics = _pair_statistics(result)
+    if not statistics:
+        return _section("Range residuals", '<p class="sub">No range was used.</p>')
+    kinds = _pair_kinds(result, statistics)
+    options = "".join(f'<option value="{k}">{a} – {b}</option>' for k, (a, b) in enumerate(statistics))
+    rows = []
+    for (a, b), r in sorted(statistics.items(), key=lambda item: -_rms(item[1]))[:_PAIRS]:
+        median = float(np.median(r))
+        spread = 1.4826 * float(np.median(np.abs(r - median)))
+        figures = [f"{median:+.3f}", f"{spread:.3f}", f"{_rms(r):.3f}", f"{np.abs(r).max():.3f}"]
+        rows.append((f"{a} – {b}", ("robot – beacon", "beacon – beacon")[kinds[a, b]], str(len(r)), *figures))
+    head = ("Pair", "Kind", "Count", "Median [m]", "Spread [m]", "RMS [m]", "Largest [m]")
+    more = (
+        f'<p class="sub">The {_PAIRS} pairs with the largest RMS of {len(statistics)}.</p>'
+        if len(rows) < len(statistics)
+        else ""
+    )
+    return _section(
+        "Range residuals",
+        '<div class="bar"><span class="sub">Measured minus predicted [m]</span><label class="push">Pair '
+        f'<select id="pair"><option value="">all</option>{options}</select></label></div><div id="residuals"></div>'
+        '<div class="legend"><span><i style="background: var(--accent)"></i>robot – beacon</span>'
+        '<span><i style="background: var(--second)"></i>beacon – beacon</span>'
+        "<span>Outliers are drawn at the edge; spread is 1.4826 times the median absolute deviation.</span></div>"
+        f'<details style="margin-top: 14px"><summary>Each pair</summary>{more}'
+        f'<div class="tall">{_table(head, rows, range(2, 7))}</div></details>',
+    )
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _pair_statistics(result: Result) -> dict[tuple[int, int], np.ndarray]:
+    """Finite residuals [m] of each pair of nodes, the smaller id first."""
+    rows = result.range_residuals.reshape(-1, 4)
+    rows = rows[np.isfinite(rows).all(axis=1)]
+    nodes = np.sort(rows[:, 1:3].astype(np.int64), axis=1)
+    pairs, which = np.unique(nodes, axis=0, return_inverse=True)
+    return {(int(a), int(b)): rows[which.ravel() == k, 3] for k, (a, b) in enumerate(pairs)}
+
+
+def _pair_kinds(result: Result, pairs: Iterable[tuple[int, int]]) -> dict[tuple[int, int], int]:
+    """1 for two beacons, 0 where the robot takes part."""
+    beacons = {beacon.id for beacon in result.beacons}
+    return {pair: int(pair[0] in beacons and pair[1] in beacons) for pair in pairs}
+
+
+# The data behind the map and the charts.
+
+
+def _numbers(values: np.ndarray, digits: int) -> list[Any]:
+    """Rounded numbers for JSON, None where not finite."""
+    rounded = np.round(np.asarray(values, float), digits)
+    return [None if not np.isfinite(v) else int(v) if v == int(v) else v for v in rounded.ravel().tolist()]
+
+
+def _data(result: Result) -> dict[str, Any]:
+    """All that report.js draws."""
+    seconds = (result.stamps - result.stamps[0]) / 1e9 if len(result.stamps) else np.zeros(0)
+    pick = np.unique(np.linspace(0, max(len(seconds) - 1, 0), _POSES).astype(int)) if len(seconds) else slice(0)
+    poses, covs = result.poses[pick], result.pose_covs[pick]
+    track = {"t": _numbers(seconds[pick], 3)}
+    track |= {name: _numbers(poses[:, k], 3) for k, name in enumerate(("x", "y", "yaw"))}
+    track |= {"xx": _numbers(covs[:, 0, 0], 6), "xy": _numbers(covs[:, 0, 1], 6), "yy": _numbers(covs[:, 1, 1], 6)}
+    picture = _picture(result.map)
+    return {
+        "duration": max(_span(result), 1e-3),
+        "extent": _extent(result, picture),
+        "track": track,
+        "beacons": [_beacon(b, result.beacon_tracks.get(b.id)) for b in result.beacons],
+        "scan": [_numbers(point, 3) for point in result.scan_points],
+        "map": picture,
+        "diagnostics": _diagnostics(result),
+        "residuals": _residuals(result),
+    }
+
+
+def _beacon(beacon: BeaconEstimate, path: np.ndarray | None) -> dict[str, Any]:
+    x, y = _numbers(beacon.position, 4)
+    cov = beacon.cov
+    out = {"id": beacon.id, "status": beacon.status, "x": x, "y": y, "track": None}
+    out["cov"] = _numbers(np.array([cov[0, 0], cov[0, 1], cov[1, 1]]), 8)
+    if path is not None and len(path):
+        thin = path[:: max(1, len(path) // 500)]
+        out["track"] = {name: _numbers(thin[:, k], 4) for k, name in enumerate(("t", "x", "y", "sigma"))}
+    return out
+
+
+def _diagnostics(result: Result) -> list[dict[str, Any]]:
+    """The series that hold one finite number a frame at least, thinned so that peaks stay."""
+    known = [name for name in _DIAGNOSTICS if name in result.diagnostics]
+    series = []
+    for name in [*known, *(name for name in result.diagnostics if name not in _DIAGNOSTICS)]:
+        values = np.asarray(result.diagnostics[name])
+        if values.shape != result.stamps.shape or values.dtype.kind not in "biuf" or not np.isfinite(values).any():
+            continue
+        pick = _thin(values.astype(float), _SAMPLES)
+        label, unit = _DIAGNOSTICS.get(name, (name.replace("_", " ").capitalize(), ""))
+        series.append(
+            {
+                "name": label,
+                "unit": unit,
+                "steps": values.dtype.kind != "f",
+                "t": _numbers((result.stamps[pick] - result.stamps[0]) / 1e9, 3),
+                "v": _numbers(values[pick], 5),
+            }
+        )
+    return series
+
+
+def _thin(values: np.ndarray, count: int) -> np.ndarray:
+    """Indices of at most about `count` values: the least and the greatest of each stretch."""
+    if len(values) <= count:
+        return np.arange(len(values))
+    keep: list[int] = []
+    for stretch in np.array_split(np.arange(len(values)), count // 2):
+        here = values[stretch]
+        if np.isfinite(here).any():
+            keep += sorted({int(stretch[np.nanargmin(here)]), int(stretch[np.nanargmax(here)])})
+        else:
+            keep.append(int(stretch[0]))
+    return np.array(keep)
+
+
+def _residuals(result: Result) -> dict[str, Any]:
+    """Residuals for the chart: time, pair, value [m]; the bound of the axis leaves the gross outliers out."""
+    rows = result.range_residuals.reshape(-1, 4)
+    rows = rows[np.isfinite(rows).all(axis=1)]
+    statistics = _pair_statistics(result)
+    number = {pair: k for k, pair in enumerate(statistics)}
+    kinds = _pair_kinds(result, statistics)
+    bound = max(float(np.quantile(np.abs(rows[:, 3]), 0.98)) * 1.25, 0.05) if len(rows) else 1.0
+    rows = rows[:: -(-len(rows) // _RESIDUALS) or 1]
+    return {
+        "t": _numbers(rows[:, 0], 2),
+        "v": _numbers(rows[:, 3], 3),
+        "pair": [number[min(a, b), max(a, b)] for a, b in rows[:, 1:3].astype(int).tolist()],
+        "kind": list(kinds.values()),
+        "bound": round(bound, 3),
+    }
+
+
+def _extent(result: Result, picture: dict[str, Any] | None) -> list[float]:
+    """x0, y0, x1, y1 of all that is drawn [m]."""
+    spots = [result.poses[:, :2], *(b.position[None] for b in result.beacons), result.scan_points.reshape(-1, 2)]
+    if picture:
+        x, y = picture["origin"]
+        spots.append(np.array([[x, y], [x + picture["cols"] * picture["cell"], y + picture["rows"] * picture["cell"]]]))
+    points = np.concatenate([np.asarray(spot, float) for spot in spots])
+    points = points[np.isfinite(points).all(axis=1)]
+    if not len(points):
+        return [-5.0, -5.0, 5.0, 5.0]
+    middle, half = (points.min(0) + points.max(0)) / 2, (points.max(0) - points.min(0)) / 2 + 0.5
+    return [float(v) for v in (*(middle - half), *(middle + half))]
+
+
+def _picture(image: MapImage) -> dict[str, Any] | None:
+    """The observed part of the map as a PNG: grey is 255 (1 - p), never observed is transparent."""
+    odds = np.nan_to_num(np.asarray(image.log_odds, np.float32))
+    rows, cols = np.flatnonzero(odds.any(axis=1)), np.flatnonzero(odds.any(axis=0))
+    if not len(rows):
+        return None
+    odds = odds[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
+    factor = -(-max(odds.shape) // _PIXELS)
+    if factor > 1:  # a wall stays a wall however small it is drawn
+        odds = np.pad(odds, [(0, -side % factor) for side in odds.shape])
+        blocks = odds.reshape(odds.shape[0] // factor, factor, odds.shape[1] // factor, factor)
+        greatest, least = blocks.max(axis=(1, 3)), blocks.min(axis=(1, 3))
+        odds = np.where(greatest > 0, greatest, least)
+    grey = np.round(255 / (1 + np.exp(np.clip(odds, -30, 30)))).astype(np.uint8)
+    pixels = np.stack([grey, np.where(odds != 0, 255, 0).astype(np.uint8)], axis=-1)[::-1]
+    corner = np.asarray(image.origin, float) + image.resolution * np.array([cols[0], rows[0]])
+    return {
+        "png": "data:image/png;base64," + base64.b64encode(_png(pixels)).decode(),
+        "origin": [float(v) for v in corner],
+        "cell": float(image.resolution * factor),
+        "rows": odds.shape[0],
+        "cols": odds.shape[1],
+    }
+
+
+def _png(pixels: np.ndarray) -> bytes:
+    """Grey and alpha (rows, cols, 2) uint8, top row first, as a PNG file (ISO/IEC 15948)."""
+    rows, cols, _ = pixels.shape
+
+    def chunk(kind: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    header = struct.pack(">IIBBBBB", cols, rows, 8, 4, 0, 0, 0)  # 8 bits a sample, grey and alpha
+    lines = np.concatenate([np.zeros((rows, 1), np.uint8), pixels.reshape(rows, -1)], axis=1)  # filter 0 each
+    body = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(lines.tobytes(), 9)) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + body

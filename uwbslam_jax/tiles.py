@@ -1,0 +1,90 @@
+"""The part of the map outside the device's window: tiles on the host. The window follows the robot in whole tiles."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+
+from uwbslam_jax.grid import Grid
+from uwbslam_jax.result import MapImage
+
+TILE = 64
+"""Finest cells along a tile's side."""
+_SLACK = 2
+"""The window moves when the robot is more than this many tiles off its middle."""
+
+
+class Tiles:
+    """Tiles that left the window, by their (row, col) in the world; only what was ever observed is kept."""
+
+    def __init__(self, resolution: float):
+        self.resolution = resolution
+        self._kept: dict[tuple[int, int], list[np.ndarray]] = {}
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def clear(self) -> None:
+        """Forget all: the map is drawn anew."""
+        self._kept.clear()
+
+    def needs_move(self, origin: np.ndarray, cells: int, robot: np.ndarray) -> bool:
+        """Whether the robot (2,) [m] is too far off the middle of the window at origin (2,) [m]."""
+        return bool(np.abs(self._offset(origin, cells, robot)).max() > _SLACK)
+
+    def _offset(self, origin: np.ndarray, cells: int, robot: np.ndarray) -> np.ndarray:
+        middle = origin + cells * self.resolution / 2
+        return np.round((robot - middle) / (TILE * self.resolution)).astype(int)
+
+    def recentre(self, grid: Grid, robot: np.ndarray) -> Grid:
+        """The window moved over the robot: what leaves it is kept, what was kept comes back."""
+        cells = grid.levels[0].shape[0]
+        origin = np.asarray(grid.origin)
+        shift = self._offset(origin, cells, robot)
+        old = [np.asarray(level) for level in grid.levels]
+        new = [np.zeros_like(level) for level in old]
+        count = cells // TILE
+        first = np.round(origin / (TILE * self.resolution)).astype(int)
+        for row in range(count):
+            for col in range(count):
+                r, c = row - shift[1], col - shift[0]
+                blocks = [level[_block(k, row, col)] for k, level in enumerate(old)]
+                if 0 <= r < count and 0 <= c < count:
+                    for k, block in enumerate(blocks):
+                        new[k][_block(k, r, c)] = block
+                elif any(block.any() for block in blocks):
+                    self._kept[first[1] + row, first[0] + col] = [block.copy() for block in blocks]
+        first = first + shift
+        for row in range(count):
+            for col in range(count):
+                for k, block in enumerate(self._kept.pop((first[1] + row, first[0] + col), [])):
+                    new[k][_block(k, row, col)] = block
+        corner = first * (TILE * self.resolution)
+        return Grid(tuple(jnp.asarray(level) for level in new), jnp.asarray(corner, jnp.float32))
+
+    def image(self, grid: Grid) -> MapImage:
+        """The whole map at the finest level, window and tiles, cropped to what was observed."""
+        side = TILE * self.resolution
+        first = np.round(np.asarray(grid.origin) / side).astype(int)
+        window = np.asarray(grid.levels[0])
+        count = window.shape[0] // TILE
+        every = {key: blocks[0] for key, blocks in self._kept.items()}
+        for row in range(count):
+            for col in range(count):
+                block = window[_block(0, row, col)]
+                if block.any():
+                    every[first[1] + row, first[0] + col] = block
+        if not every:
+            return MapImage(np.zeros((1, 1), np.float32), self.resolution, np.zeros(2))
+        rows, cols = np.array(list(every)).T
+        low = np.array([rows.min(), cols.min()])
+        shape = (np.array([rows.max(), cols.max()]) - low + 1) * TILE
+        whole = np.zeros(shape, np.float32)
+        for (row, col), block in every.items():
+            whole[_block(0, row - low[0], col - low[1])] = block
+        return MapImage(whole, self.resolution, low[::-1] * side)
+
+
+def _block(level: int, row: int, col: int) -> tuple[slice, slice]:
+    size = TILE >> level
+    return slice(row * size, (row + 1) * size), slice(col * size, (col + 1) * size)
