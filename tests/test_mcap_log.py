@@ -346,6 +346,30 @@ class TestBrokenFiles:
         assert len(list(reader)) == count
         assert f"(byte {end} of" in str(reader.truncated)
 
+    @pytest.mark.parametrize("chunked", [True, False])
+    def test_damaged_anywhere(self, tmp_path: Path, chunked: bool) -> None:
+        """Whatever bytes are wrong, a file is read or refused with one line, and can be inspected or is refused."""
+        schema, data = ros_types.encode(scan(T0))
+        many = [("/scan", T0 + k, data) for k in range(60)]
+        path = write_raw(
+            tmp_path / "a.mcap", {"/scan": ros_channel(schema)}, many, chunk_size=1000, use_chunking=chunked
+        )
+        whole = path.read_bytes()
+        rng = np.random.default_rng(0)
+        for _ in range(150):
+            content = bytearray(whole)
+            for at in rng.integers(8, len(whole), rng.integers(1, 8)):
+                content[at] = rng.integers(256)
+            path.write_bytes(content)
+            for read in (lambda: list(LogReader(path)), lambda: log_summary.format_summary(log_summary.inspect(path))):
+                try:
+                    read()
+                except LogError as error:
+                    complaint = str(error)
+                else:
+                    complaint = ""
+                assert len(complaint.splitlines()) <= 1
+
     def test_overlapping_chunks_come_in_order(self, tmp_path: Path) -> None:
         schema, data = ros_types.encode(scan(T0))
         times = [T0 + 10 * k + (35 if k % 5 == 0 else 0) for k in range(200)]

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import heapq
 import math
+import struct
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +18,7 @@ from uwbslam_jax.ros_types import build, definition, header, pose, quaternion, s
 
 DIAGNOSTICS_PERIOD = 100_000_000  # at most 10 Hz [ns]
 BEACONS_PERIOD = 1_000_000_000  # about 1 Hz [ns]
-MAP_FRAME, ROBOT_FRAME, UWB_FRAME = "map", "base_link", "uwb"
+MAP_FRAME, UWB_FRAME = "map", "uwb"
 _COLORS = {  # of a beacon, by status
     "static": (0.1, 0.6, 0.2),
     "moving": (0.9, 0.5, 0.0),
@@ -25,12 +27,19 @@ _COLORS = {  # of a beacon, by status
 }
 
 
+# Poses and transforms are packed by hand: there is one of each a frame, and the type store takes 0.1 ms for each.
+_POSE_TYPE, _TF_TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped", "tf2_msgs/msg/TFMessage"
+_POSE = struct.Struct("<4siII4s7d36d")  # CDR, stamp, "map\0", position and orientation, covariance
+_TF = struct.Struct("<4sIiII4sI10s6x7d")  # CDR, one transform: stamp, "map\0", "base_link\0", padding, both vectors
+_CDR = b"\x00\x01\x00\x00"
+
+
 class _Item(NamedTuple):
-    """A message to be built when its turn comes, so that only one is in memory."""
+    """A message to be made when its turn comes, so that only one is in memory: its type and CDR bytes."""
 
     stamp: int
     topic: str
-    build: Callable[[], Any]
+    make: Callable[[], tuple[str, bytes]]
 
 
 def write_result_log(result: Result, path: str | Path) -> None:
@@ -52,11 +61,10 @@ def write_result_log(result: Result, path: str | Path) -> None:
     channels: dict[str, int] = {}
     with RecordWriter(path, chunk_size=1 << 20) as records:
         for item in heapq.merge(*streams, key=lambda item: item.stamp):
-            message = item.build()
+            schema, data = item.make()
             if item.topic not in channels:
-                schema = message.__msgtype__
                 channels[item.topic] = records.add_topic(item.topic, schema, definition(schema))
-            records.write(channels[item.topic], serialize(message), item.stamp)
+            records.write(channels[item.topic], data, item.stamp)
 
 
 def crop(image: MapImage) -> MapImage:
@@ -70,17 +78,20 @@ def crop(image: MapImage) -> MapImage:
 
 
 def _once(result: Result, start: int, known: np.ndarray) -> Iterator[_Item]:
-    yield _Item(start, "/tf", lambda: _transform(start, UWB_FRAME, 0.0, 0.0, 0.0))
-    yield _Item(start, "/map", lambda: _grid(result.map, start))
-    yield _Item(start, "/path", lambda: _path(result, start, known))
+    yield _Item(start, "/tf", lambda: _packed(_transform(start, UWB_FRAME, 0.0, 0.0, 0.0)))
+    yield _Item(start, "/map", lambda: _packed(_grid(result.map, start)))
+    yield _Item(start, "/path", lambda: _packed(_path(result, start, known)))
+
+
+def _packed(message: Any) -> tuple[str, bytes]:
+    return message.__msgtype__, serialize(message)
 
 
 def _poses(result: Result, known: np.ndarray) -> Iterator[_Item]:
     for index in known:
         stamp, (x, y, yaw) = int(result.stamps[index]), result.poses[index].tolist()
-        cov = result.pose_covs[index]
-        yield _Item(stamp, "/pose", lambda s=stamp, x=x, y=y, yaw=yaw, cov=cov: _pose(s, x, y, yaw, cov))
-        yield _Item(stamp, "/tf", lambda s=stamp, x=x, y=y, yaw=yaw: _transform(s, ROBOT_FRAME, x, y, yaw))
+        yield _Item(stamp, "/pose", partial(_pose, stamp, x, y, yaw, result.pose_covs[index]))
+        yield _Item(stamp, "/tf", partial(_robot_transform, stamp, x, y, yaw))
 
 
 def _beacons(result: Result, start: int) -> Iterator[_Item]:
@@ -94,8 +105,8 @@ def _beacons(result: Result, start: int) -> Iterator[_Item]:
         past = {number: int(np.searchsorted(track[:, 0], seconds, side="right")) for number, track in tracks}
         known = {number: track[past[number] - 1] for number, track in tracks if past[number]}
         if known:
-            yield _Item(stamp, "/beacons", lambda s=stamp, known=known: _track_markers(s, known))
-    yield _Item(end, "/beacons", lambda: _final_markers(end, result.beacons))
+            yield _Item(stamp, "/beacons", lambda s=stamp, known=known: _packed(_track_markers(s, known)))
+    yield _Item(end, "/beacons", lambda: _packed(_final_markers(end, result.beacons)))
 
 
 def _diagnostics(result: Result) -> Iterator[_Item]:
@@ -103,15 +114,22 @@ def _diagnostics(result: Result) -> Iterator[_Item]:
     for index, stamp in enumerate(result.stamps.tolist() if result.diagnostics else []):
         if last is None or stamp - last >= DIAGNOSTICS_PERIOD:
             last = stamp
-            yield _Item(stamp, "/diagnostics", lambda s=stamp, index=index: _status(s, result.diagnostics, index))
+            make = partial(_status, stamp, result.diagnostics, index)
+            yield _Item(stamp, "/diagnostics", lambda make=make: _packed(make()))
 
 
-def _pose(stamp: int, x: float, y: float, yaw: float, cov: np.ndarray) -> Any:
+def _pose(stamp: int, x: float, y: float, yaw: float, cov: np.ndarray) -> tuple[str, bytes]:
     """PoseWithCovarianceStamped; (3, 3) over x, y, yaw goes to rows and columns 0, 1, 5 of the 6 x 6."""
     full = np.zeros((6, 6))
     full[np.ix_([0, 1, 5], [0, 1, 5])] = np.nan_to_num(cov)  # RViz refuses a NaN
-    body = build("geometry_msgs/msg/PoseWithCovariance", pose=pose(x, y, yaw), covariance=full.ravel())
-    return build("geometry_msgs/msg/PoseWithCovarianceStamped", header=header(stamp, MAP_FRAME), pose=body)
+    place = x, y, 0.0, 0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)
+    return _POSE_TYPE, _POSE.pack(_CDR, *divmod(stamp, 1_000_000_000), 4, b"map", *place, *full.ravel().tolist())
+
+
+def _robot_transform(stamp: int, x: float, y: float, yaw: float) -> tuple[str, bytes]:
+    """TFMessage of the robot: what `_transform` says, packed."""
+    place = x, y, 0.0, 0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)
+    return _TF_TYPE, _TF.pack(_CDR, 1, *divmod(stamp, 1_000_000_000), 4, b"map", 10, b"base_link", *place)
 
 
 def _transform(stamp: int, child: str, x: float, y: float, yaw: float) -> Any:
