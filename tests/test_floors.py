@@ -9,16 +9,21 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "uwbslam_jax"
 
-# Worlds lie below simulate, which draws from them.
-FLOORS: dict[int, str] = {
+# Numbers between whole ones are parts of the floor below them that stand on each other.
+FLOORS: dict[float, str] = {
     0: "__init__",
-    1: "geometry measurements config ekf result layout mcap_records schemas",
-    2: "motion ranging grid metrics frames mcap_log",
-    3: "objective",
+    1: "geometry measurements config ekf result layout mcap_records paths",
+    2: "motion ranging grid metrics frames ros_types worlds placement",
+    2.1: "schemas result_log conditions",
+    2.2: "mcap_log scenarios",
+    2.3: "log_summary",
+    3: "objective tiles",
     4: "matching",
     5: "slam",
-    6: "startup beacons paths",
-    7: "online batch worlds",
+    6: "startup beacons",
+    6.1: "history",
+    6.2: "session",
+    7: "online batch report_data",
     8: "tuning simulate report outputs",
     9: "__main__",
 }

@@ -62,7 +62,7 @@ function colourMap() { // grey level 255 (1 - p) -> the theme's colours; never o
 }
 
 function fit() {
-  let [x0, y0, x1, y1] = data.extent;
+  const [x0, y0, x1, y1] = data.extent;
   view.x = (x0 + x1) / 2; view.y = (y0 + y1) / 2;
   view.scale = 0.94 * Math.min(canvas.clientWidth / (x1 - x0), canvas.clientHeight / (y1 - y0));
   draw();
@@ -249,12 +249,13 @@ function limits(values, zero) {
   if (!(hi > lo)) return Number.isFinite(lo) ? [lo - 0.5, lo + 0.5] : [0, 1];
   return [lo < 0 || !zero ? lo - (hi - lo) * 0.05 : lo, hi + (hi - lo) * 0.05];
 }
-function frame(box, height, [lo, hi], body, name) { // axes around a body made by (x, y) -> svg text
+// Axes around a body made by (x, y) -> svg text; whole: no ticks between whole numbers.
+function frame(box, height, [lo, hi], body, name, whole = false) {
   const width = Math.max(box.clientWidth, 200);
   const x = (t) => pad.left + t / duration * (width - pad.left - pad.right);
   const y = (v) => height - pad.bottom - (v - lo) / (hi - lo) * (height - pad.top - pad.bottom);
   let axes = "";
-  const ystep = niceStep((hi - lo) / 4), digits = clamp(-Math.floor(Math.log10(ystep) + 1e-9), 0, 6);
+  const ystep = Math.max(niceStep((hi - lo) / 4), whole ? 1 : 0), digits = clamp(-Math.floor(Math.log10(ystep) + 1e-9), 0, 6);
   for (let v = Math.ceil(lo / ystep) * ystep; v <= hi + ystep * 1e-6; v += ystep)
     axes += `<line class="grid" x1="${pad.left}" x2="${width - pad.right}" y1="${y(v)}" y2="${y(v)}"/>` +
       `<text x="${pad.left - 6}" y="${y(v) + 4}" text-anchor="end">${(Math.abs(v) < ystep * 1e-6 ? 0 : v).toFixed(digits)}</text>`;
@@ -279,7 +280,7 @@ function lineChart(box, series) {
       pen = true; before = Y;
     }
     return `<path class="series" d="${d}"/>`;
-  }, series.name);
+  }, series.name, steps);
 }
 function residualChart(box) {
   const r = data.residuals, chosen = $("pair").value, bound = r.bound;

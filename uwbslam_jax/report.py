@@ -1,16 +1,14 @@
 """A run as one HTML page that opens offline: figures, map with a player, charts and tables.
 
-The page's looks are in report.html, its map and charts in report.js; here its data and tables are written.
+The page's looks are in report.html, its map and charts in report.js; its data comes from report_data; here its words
+and tables are written.
 """
 
 from __future__ import annotations
 
-import base64
 import html
 import json
 import re
-import struct
-import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
@@ -21,10 +19,10 @@ from typing import Any
 import numpy as np
 
 from uwbslam_jax import __version__
-from uwbslam_jax.result import BeaconEstimate, MapImage, Result
+from uwbslam_jax.report_data import diagnostics, page_data, pair_kinds, pair_residuals, span
+from uwbslam_jax.result import BeaconEstimate, Result
 
-# Embedded at most: what a screen can show and a file of a few megabytes holds.
-_POSES, _SAMPLES, _RESIDUALS, _PAIRS, _PIXELS = 6000, 2000, 12_000, 60, 2000
+_PAIRS = 60  # rows of the table of pairs
 
 # name -> label, unit, digits. What is not listed is shown all the same, under its own name.
 _FIGURES: dict[str, tuple[str, str, int]] = {
@@ -44,22 +42,14 @@ _FIGURES: dict[str, tuple[str, str, int]] = {
     "beacon_mean_m": ("Beacons, mean", "m", 3),
     "beacon_max_m": ("Beacons, largest", "m", 3),
     "covered": ("Share of the time covered", "", 3),
+    "frame_decided_s": ("Frame decided at", "s", 1),
     "beacons_missing": ("Beacons missing", "", 0),
     "pose_nees": ("Pose NEES", "", 2),
     "pose_nees_ratio": ("Pose NEES / dof", "", 2),
     "beacon_nees": ("Beacon NEES", "", 2),
     "beacon_nees_ratio": ("Beacon NEES / dof", "", 2),
 }
-# name -> label, unit; the order is that on the page.
-_DIAGNOSTICS: dict[str, tuple[str, str]] = {
-    "match_score": ("Match score", ""),
-    "score": ("Match score", ""),
-    "step_ms": ("Step time", "ms"),
-    "hypotheses": ("Hypotheses", ""),
-    "ranges_used": ("Ranges used", "a frame"),
-    "searched": ("Wide searches", ""),
-    "searches": ("Wide searches", ""),
-}
+_UNITS = ("m", "s", "ms", "deg", "rad", "Hz")  # as the last part of a figure's name
 _SHOWN_APART = {"config", "warnings", "events", "dropped"}
 
 
@@ -92,7 +82,7 @@ def write_report(
         "sections": _sections(result, metrics),
         "footer": f"uwbslam_jax {html.escape(__version__)}",
         # A closing tag inside a text would end the script element; the escape means the same to JSON.
-        "data": json.dumps(_data(result), separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
+        "data": json.dumps(page_data(result), separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
         "script": folder.joinpath("report.js").read_text(encoding="utf-8"),
     }
     template = folder.joinpath("report.html").read_text(encoding="utf-8")
@@ -101,20 +91,12 @@ def write_report(
     Path(path).write_text(page, encoding="utf-8")
 
 
-# The words: headline, notices, tables.
-
-
 def _subtitle(result: Result) -> str:
     if not len(result.stamps):
         return "No scan was processed."
     begin = datetime.fromtimestamp(int(result.stamps[0]) / 1e9, UTC)
     when = f"{begin:%Y-%m-%d %H:%M:%S} UTC · " if begin.year > 2000 else ""
-    return f"{when}{_span(result):.1f} s · {len(result.stamps)} frames · {_driven(result):.1f} m driven"
-
-
-def _span(result: Result) -> float:
-    """Time from the first to the last frame [s]."""
-    return float(result.stamps[-1] - result.stamps[0]) / 1e9 if len(result.stamps) else 0.0
+    return f"{when}{span(result):.1f} s · {len(result.stamps)} frames · {_driven(result):.1f} m driven"
 
 
 def _driven(result: Result) -> float:
@@ -189,7 +171,7 @@ def _tiles(result: Result, metrics: Mapping[str, Any] | None) -> str:
     tiles += [
         ("Beacons placed", str(len(result.beacons)), ", ".join(f"{n} {html.escape(s)}" for s, n in states.items())),
         ("Frame decided", html.escape(at) if decided else "not decided", "after the first scan" if at != "yes" else ""),
-        ("Driven", _figure(_driven(result), "m", 1), f"in {_figure(_span(result), 's', 1)}"),
+        ("Driven", _figure(_driven(result), "m", 1), f"in {_figure(span(result), 's', 1)}"),
         (
             "Step time, median",
             _figure(summary["step_ms_median"], "ms", 2),
@@ -197,11 +179,12 @@ def _tiles(result: Result, metrics: Mapping[str, Any] | None) -> str:
         ),
         ("Real-time factor", _figure(summary["real_time_factor"], "×", 1), "recorded time over computing time"),
     ]
-    return "".join(
+    cells = "".join(
         f'<div class="tile"><div class="name">{name}</div><div class="value">{value}</div>'
         f'<div class="note">{note}</div></div>'
         for name, value, note in tiles
     )
+    return f'<div class="tiles{" five" if metrics is None else ""}">{cells}</div>'
 
 
 def _figure(value: Any, unit: str, digits: int) -> str:
@@ -209,7 +192,7 @@ def _figure(value: Any, unit: str, digits: int) -> str:
     if not isinstance(value, int | float | np.number) or not np.isfinite(value):
         return "–"
     space = "" if unit in ("°", "×") else " "
-    return f"{value:.{digits}f}{space}<small>{html.escape(unit)}</small>"
+    return f"{value:.{digits}f}" + (f"{space}<small>{html.escape(unit)}</small>" if unit else "")
 
 
 def _text(value: Any) -> str:
@@ -229,9 +212,12 @@ def _text(value: Any) -> str:
 
 def _label(name: str, value: Any) -> tuple[str, str]:
     """Name and value of a figure as plain text."""
-    label, unit, digits = _FIGURES.get(name, (name.replace("_", " "), "", -1))
-    if digits >= 0 and isinstance(value, int | float) and not isinstance(value, bool) and np.isfinite(value):
-        return label, f"{value:.{digits}f} {unit}".rstrip()
+    stem, _, suffix = name.rpartition("_")
+    plain = (stem, suffix, -1) if stem and suffix in _UNITS else (name, "", -1)
+    label, unit, digits = _FIGURES.get(name, plain)
+    label = label[:1].upper() + label[1:].replace("_", " ")
+    if isinstance(value, int | float) and not isinstance(value, bool) and np.isfinite(value):
+        return label, f"{value:.{digits}f} {unit}".rstrip() if digits >= 0 else f"{_text(value)} {unit}".rstrip()
     return label, _text(value)
 
 
@@ -308,8 +294,8 @@ def _beacon_table(beacons: Sequence[BeaconEstimate]) -> str:
     rows = []
     for b in sorted(beacons, key=lambda b: b.id):
         sigma = np.sqrt(np.maximum(np.diagonal(b.cov), 0))
-        numbers = [*(f"{v:.3f}" for v in b.position), *(f"{v:.4f}" for v in sigma)]
-        cells = "".join(f'<td class="n">{"–" if v == "nan" else v}</td>' for v in numbers)
+        numbers = [*((v, 3) for v in b.position), *((v, 4) for v in sigma)]
+        cells = "".join(f'<td class="n">{_figure(float(v), "", digits)}</td>' for v, digits in numbers)
         kind = re.sub(r"\W", "", b.status)
         status = html.escape(b.status)
         rows.append(f'<tr><td class="n">{b.id}</td>{cells}<td class="status {kind}">{status}</td></tr>')
@@ -318,7 +304,7 @@ def _beacon_table(beacons: Sequence[BeaconEstimate]) -> str:
 
 
 def _chart_section(result: Result) -> str:
-    shown = _diagnostics(result)
+    shown = diagnostics(result)
     if not shown:
         return ""
     boxes = "".join(
@@ -331,10 +317,10 @@ def _chart_section(result: Result) -> str:
 
 def _residual_section(result: Result) -> str:
     """Chart of the residuals, and a table of each pair's."""
-    statistics = _pair_statistics(result)
+    statistics = pair_residuals(result)
     if not statistics:
         return _section("Range residuals", '<p class="sub">No range was used.</p>')
-    kinds = _pair_kinds(result, statistics)
+    kinds = pair_kinds(result, statistics)
     options = "".join(f'<option value="{k}">{a} – {b}</option>' for k, (a, b) in enumerate(statistics))
     rows = []
     for (a, b), r in sorted(statistics.items(), key=lambda item: -_rms(item[1]))[:_PAIRS]:
@@ -362,165 +348,3 @@ def _residual_section(result: Result) -> str:
 
 def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2)))
-
-
-def _pair_statistics(result: Result) -> dict[tuple[int, int], np.ndarray]:
-    """Finite residuals [m] of each pair of nodes, the smaller id first."""
-    rows = result.range_residuals.reshape(-1, 4)
-    rows = rows[np.isfinite(rows).all(axis=1)]
-    nodes = np.sort(rows[:, 1:3].astype(np.int64), axis=1)
-    pairs, which = np.unique(nodes, axis=0, return_inverse=True)
-    return {(int(a), int(b)): rows[which.ravel() == k, 3] for k, (a, b) in enumerate(pairs)}
-
-
-def _pair_kinds(result: Result, pairs: Iterable[tuple[int, int]]) -> dict[tuple[int, int], int]:
-    """1 for two beacons, 0 where the robot takes part."""
-    beacons = {beacon.id for beacon in result.beacons}
-    return {pair: int(pair[0] in beacons and pair[1] in beacons) for pair in pairs}
-
-
-# The data behind the map and the charts.
-
-
-def _numbers(values: np.ndarray, digits: int) -> list[Any]:
-    """Rounded numbers for JSON, None where not finite."""
-    rounded = np.round(np.asarray(values, float), digits)
-    return [None if not np.isfinite(v) else int(v) if v == int(v) else v for v in rounded.ravel().tolist()]
-
-
-def _data(result: Result) -> dict[str, Any]:
-    """All that report.js draws."""
-    seconds = (result.stamps - result.stamps[0]) / 1e9 if len(result.stamps) else np.zeros(0)
-    pick = np.unique(np.linspace(0, max(len(seconds) - 1, 0), _POSES).astype(int)) if len(seconds) else slice(0)
-    poses, covs = result.poses[pick], result.pose_covs[pick]
-    track = {"t": _numbers(seconds[pick], 3)}
-    track |= {name: _numbers(poses[:, k], 3) for k, name in enumerate(("x", "y", "yaw"))}
-    track |= {"xx": _numbers(covs[:, 0, 0], 6), "xy": _numbers(covs[:, 0, 1], 6), "yy": _numbers(covs[:, 1, 1], 6)}
-    picture = _picture(result.map)
-    return {
-        "duration": max(_span(result), 1e-3),
-        "extent": _extent(result, picture),
-        "track": track,
-        "beacons": [_beacon(b, result.beacon_tracks.get(b.id)) for b in result.beacons],
-        "scan": [_numbers(point, 3) for point in result.scan_points],
-        "map": picture,
-        "diagnostics": _diagnostics(result),
-        "residuals": _residuals(result),
-    }
-
-
-def _beacon(beacon: BeaconEstimate, path: np.ndarray | None) -> dict[str, Any]:
-    x, y = _numbers(beacon.position, 4)
-    cov = beacon.cov
-    out = {"id": beacon.id, "status": beacon.status, "x": x, "y": y, "track": None}
-    out["cov"] = _numbers(np.array([cov[0, 0], cov[0, 1], cov[1, 1]]), 8)
-    if path is not None and len(path):
-        thin = path[:: max(1, len(path) // 500)]
-        out["track"] = {name: _numbers(thin[:, k], 4) for k, name in enumerate(("t", "x", "y", "sigma"))}
-    return out
-
-
-def _diagnostics(result: Result) -> list[dict[str, Any]]:
-    """The series that hold one finite number a frame at least, thinned so that peaks stay."""
-    known = [name for name in _DIAGNOSTICS if name in result.diagnostics]
-    series = []
-    for name in [*known, *(name for name in result.diagnostics if name not in _DIAGNOSTICS)]:
-        values = np.asarray(result.diagnostics[name])
-        if values.shape != result.stamps.shape or values.dtype.kind not in "biuf" or not np.isfinite(values).any():
-            continue
-        pick = _thin(values.astype(float), _SAMPLES)
-        label, unit = _DIAGNOSTICS.get(name, (name.replace("_", " ").capitalize(), ""))
-        series.append(
-            {
-                "name": label,
-                "unit": unit,
-                "steps": values.dtype.kind != "f",
-                "t": _numbers((result.stamps[pick] - result.stamps[0]) / 1e9, 3),
-                "v": _numbers(values[pick], 5),
-            }
-        )
-    return series
-
-
-def _thin(values: np.ndarray, count: int) -> np.ndarray:
-    """Indices of at most about `count` values: the least and the greatest of each stretch."""
-    if len(values) <= count:
-        return np.arange(len(values))
-    keep: list[int] = []
-    for stretch in np.array_split(np.arange(len(values)), count // 2):
-        here = values[stretch]
-        if np.isfinite(here).any():
-            keep += sorted({int(stretch[np.nanargmin(here)]), int(stretch[np.nanargmax(here)])})
-        else:
-            keep.append(int(stretch[0]))
-    return np.array(keep)
-
-
-def _residuals(result: Result) -> dict[str, Any]:
-    """Residuals for the chart: time, pair, value [m]; the bound of the axis leaves the gross outliers out."""
-    rows = result.range_residuals.reshape(-1, 4)
-    rows = rows[np.isfinite(rows).all(axis=1)]
-    statistics = _pair_statistics(result)
-    number = {pair: k for k, pair in enumerate(statistics)}
-    kinds = _pair_kinds(result, statistics)
-    bound = max(float(np.quantile(np.abs(rows[:, 3]), 0.98)) * 1.25, 0.05) if len(rows) else 1.0
-    rows = rows[:: -(-len(rows) // _RESIDUALS) or 1]
-    return {
-        "t": _numbers(rows[:, 0], 2),
-        "v": _numbers(rows[:, 3], 3),
-        "pair": [number[min(a, b), max(a, b)] for a, b in rows[:, 1:3].astype(int).tolist()],
-        "kind": list(kinds.values()),
-        "bound": round(bound, 3),
-    }
-
-
-def _extent(result: Result, picture: dict[str, Any] | None) -> list[float]:
-    """x0, y0, x1, y1 of all that is drawn [m]."""
-    spots = [result.poses[:, :2], *(b.position[None] for b in result.beacons), result.scan_points.reshape(-1, 2)]
-    if picture:
-        x, y = picture["origin"]
-        spots.append(np.array([[x, y], [x + picture["cols"] * picture["cell"], y + picture["rows"] * picture["cell"]]]))
-    points = np.concatenate([np.asarray(spot, float) for spot in spots])
-    points = points[np.isfinite(points).all(axis=1)]
-    if not len(points):
-        return [-5.0, -5.0, 5.0, 5.0]
-    middle, half = (points.min(0) + points.max(0)) / 2, (points.max(0) - points.min(0)) / 2 + 0.5
-    return [float(v) for v in (*(middle - half), *(middle + half))]
-
-
-def _picture(image: MapImage) -> dict[str, Any] | None:
-    """The observed part of the map as a PNG: grey is 255 (1 - p), never observed is transparent."""
-    odds = np.nan_to_num(np.asarray(image.log_odds, np.float32))
-    rows, cols = np.flatnonzero(odds.any(axis=1)), np.flatnonzero(odds.any(axis=0))
-    if not len(rows):
-        return None
-    odds = odds[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
-    factor = -(-max(odds.shape) // _PIXELS)
-    if factor > 1:  # a wall stays a wall however small it is drawn
-        odds = np.pad(odds, [(0, -side % factor) for side in odds.shape])
-        blocks = odds.reshape(odds.shape[0] // factor, factor, odds.shape[1] // factor, factor)
-        greatest, least = blocks.max(axis=(1, 3)), blocks.min(axis=(1, 3))
-        odds = np.where(greatest > 0, greatest, least)
-    grey = np.round(255 / (1 + np.exp(np.clip(odds, -30, 30)))).astype(np.uint8)
-    pixels = np.stack([grey, np.where(odds != 0, 255, 0).astype(np.uint8)], axis=-1)[::-1]
-    corner = np.asarray(image.origin, float) + image.resolution * np.array([cols[0], rows[0]])
-    return {
-        "png": "data:image/png;base64," + base64.b64encode(_png(pixels)).decode(),
-        "origin": [float(v) for v in corner],
-        "cell": float(image.resolution * factor),
-        "rows": odds.shape[0],
-        "cols": odds.shape[1],
-    }
-
-
-def _png(pixels: np.ndarray) -> bytes:
-    """Grey and alpha (rows, cols, 2) uint8, top row first, as a PNG file (ISO/IEC 15948)."""
-    rows, cols, _ = pixels.shape
-
-    def chunk(kind: bytes, body: bytes) -> bytes:
-        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-
-    header = struct.pack(">IIBBBBB", cols, rows, 8, 4, 0, 0, 0)  # 8 bits a sample, grey and alpha
-    lines = np.concatenate([np.zeros((rows, 1), np.uint8), pixels.reshape(rows, -1)], axis=1)  # filter 0 each
-    body = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(lines.tobytes(), 9)) + chunk(b"IEND", b"")
-    return b"\x89PNG\r\n\x1a\n" + body

@@ -126,7 +126,8 @@ def step(config: Config, params: Params, state: State, frame: Frame) -> tuple[St
     """
     belief = motion.predict(state.belief, params, frame.dt, frame.odometry, state.moving, state.novelty)
     belief, used = _use_ranges(config, params, state, belief, frame)
-    sweep = undo_motion(frame.scan, params.lidar, belief.mean)
+    s = layout.unpack(belief.mean)
+    sweep = undo_motion(frame.scan, params.lidar, rotation(-s.heading) @ s.velocities[0], s.yaw_rate)
     match, searched = _match(config, params, state, belief, sweep, frame.has_scan)
     surprise, information = _trust(match, belief, params)
     poor = ((match.known > _KNOWN_ENOUGH) & (match.score < _LOST_SCORE)) | (surprise > _SURPRISE)
@@ -137,20 +138,25 @@ def step(config: Config, params: Params, state: State, frame: Frame) -> tuple[St
     return state, _report(state, match, information, used, poor=poor & frame.has_scan, searched=searched, drawn=drawn)
 
 
-def undo_motion(scan: Scan, lidar: Float[Array, "3"], vector: Float[Array, "n"]) -> Sweep:
-    """The scan in the robot's frame at its stamp: each beam placed at its own time with velocity and yaw rate."""
-    s = layout.unpack(vector)
+def undo_motion(
+    scan: Scan, lidar: Float[Array, "3"], velocity: Float[Array, "2"], yaw_rate: Float[Array, ""]
+) -> Sweep:
+    """The scan in the robot's frame at its stamp: each beam placed at its own time.
+
+    Args:
+      lidar: pose of the LiDAR on the robot [m, m, rad].
+      velocity: in the robot's own frame [m/s]; yaw_rate [rad/s].
+    """
     index = jnp.arange(scan.ranges.shape[0], dtype=scan.ranges.dtype)
     bearing = scan.angle_min + scan.angle_increment * index
     age = scan.time_increment * index
     reach = jnp.where(scan.valid, scan.ranges, 0.0)
-    turn = s.yaw_rate * age
-    drift = rotation(-s.heading) @ s.velocities[0]
+    turn = yaw_rate * age
     c, sn = jnp.cos(bearing + lidar[2]), jnp.sin(bearing + lidar[2])
     x, y = lidar[0] + reach * c, lidar[1] + reach * sn
     ct, st = jnp.cos(turn), jnp.sin(turn)
-    points = jnp.stack([ct * x - st * y + drift[0] * age, st * x + ct * y + drift[1] * age], axis=-1)
-    step = scan.angle_increment + s.yaw_rate * scan.time_increment
+    points = jnp.stack([ct * x - st * y + velocity[0] * age, st * x + ct * y + velocity[1] * age], axis=-1)
+    step = scan.angle_increment + yaw_rate * scan.time_increment
     return Sweep(points, scan.valid, lidar, scan.angle_min, step, reach)
 
 

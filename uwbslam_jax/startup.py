@@ -1,50 +1,33 @@
 """Start-up without prior knowledge (DESIGN 1.7): where the beacons stand in the frame the robot started in.
 
 While the step runs on LiDAR (and odometry) alone, a `Buffer` keeps keyframes and what was ranged around them.
-`solve` places the beacons by a small batch problem over keyframe poses and beacon positions, for both reflections,
-and says how much better one explains the ranges than the other. Host code in float64: it runs once a second for
-some seconds, and chains of poses with millimetre steps are beyond float32.
+`solve` places the beacons for both reflections and says how much better one explains the ranges than the other.
+`adopt` puts a decided placement into the state: the paper's frame, the joint covariance, the map drawn again.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from uwbslam_jax.measurements import Ranges, StampedFrame
-from uwbslam_jax.slam import Estimate
+from uwbslam_jax import grid as occupancy
+from uwbslam_jax import layout, slam
+from uwbslam_jax.config import Config, Params
+from uwbslam_jax.ekf import Gaussian
+from uwbslam_jax.measurements import Ranges, Scan, StampedFrame
+from uwbslam_jax.placement import DECIDED, Keyframe, Placement, Problem, rotation
+from uwbslam_jax.slam import Estimate, State
+from uwbslam_jax.tiles import TILE
 
 _KEYFRAME_MOVED = (0.25, 0.2)
 """A keyframe every so much of path or turn [m, rad]."""
 _KEYFRAMES = 64
 """A longer start is thinned: every other keyframe goes."""
-_SOFT = 4.0
-"""Whitened residual at which a range's influence starts to fall (Geman-McClure)."""
-_RANGE_FLOOR_M = 0.02
-"""However many ranges are averaged, their mean is not better than this."""
-_DECIDED = 15.0
-"""Difference of log-likelihood that decides between the two reflections."""
 _MOVED_ENOUGH_M = 1.0
-_SIGMA_ENOUGH_M = 0.15
-"""A beacon enters when its position is known this well in the start frame."""
-
-
-@dataclass
-class Keyframe:
-    """One pose of the start-up track and the ranges taken near it.
-
-    Attributes:
-      frame: its measurements; the scan is drawn again when the frame is decided.
-      pose: (3,) in the start frame [m, m, rad].
-      information: (3, 3) of its match, in the start frame.
-      seen: slot -> list of (antenna position relative to the pose, range), robot to beacon [m].
-    """
-
-    frame: StampedFrame
-    pose: np.ndarray
-    information: np.ndarray
-    seen: dict[int, list[tuple[np.ndarray, float]]] = field(default_factory=dict)
 
 
 class Buffer:
@@ -65,18 +48,18 @@ class Buffer:
     def add(self, frame: StampedFrame, estimate: Estimate, usable: np.ndarray) -> None:
         """Take in one frame with the pose that LiDAR (and odometry) gave it, and which of its ranges may be used."""
         pose = np.asarray(estimate.pose, float)
+        velocity, yaw_rate = np.asarray(estimate.velocity, float), float(estimate.yaw_rate)
         last = self.keyframes[-1].pose if self.keyframes else None
         if last is None or (
             bool(frame.frame.has_scan)
             and not estimate.poor
             and (np.hypot(*(pose - last)[:2]) > _KEYFRAME_MOVED[0] or abs(pose[2] - last[2]) > _KEYFRAME_MOVED[1])
         ):
-            self.keyframes.append(Keyframe(frame, pose, np.asarray(estimate.information, float)))
+            self.keyframes.append(Keyframe(frame, pose, np.asarray(estimate.information, float), velocity, yaw_rate))
             if len(self.keyframes) > _KEYFRAMES:
                 self._thin()
-        r = frame.frame.ranges
         for k in np.flatnonzero(usable):
-            self._add_range(r, int(k), pose, np.asarray(estimate.velocity, float), float(estimate.yaw_rate))
+            self._add_range(frame.frame.ranges, int(k), pose, velocity, yaw_rate)
 
     def _add_range(self, r: Ranges, k: int, pose: np.ndarray, velocity: np.ndarray, yaw_rate: float) -> None:
         i, j = sorted((int(r.i[k]), int(r.j[k])))
@@ -90,9 +73,9 @@ class Buffer:
             return
         age = float(r.age[k])
         heading = pose[2] + yaw_rate * age
-        antenna = pose[:2] + age * velocity + _rotation(heading) @ self.antenna
+        antenna = pose[:2] + age * velocity + rotation(heading) @ self.antenna
         key = self.keyframes[-1]
-        local = _rotation(key.pose[2]).T @ (antenna - key.pose[:2])
+        local = rotation(key.pose[2]).T @ (antenna - key.pose[:2])
         key.seen.setdefault(j, []).append((local, flat))
 
     def _thin(self) -> None:
@@ -102,33 +85,16 @@ class Buffer:
                 kept.append(key)
                 continue
             into = kept[-1]
-            move = _rotation(into.pose[2]).T @ (key.pose[:2] - into.pose[:2])
-            turn = _rotation(key.pose[2] - into.pose[2])
+            move = rotation(into.pose[2]).T @ (key.pose[:2] - into.pose[:2])
+            turn = rotation(key.pose[2] - into.pose[2])
             for slot, seen in key.seen.items():
                 into.seen.setdefault(slot, []).extend((move + turn @ local, d) for local, d in seen)
         self.keyframes = kept
 
 
-@dataclass(frozen=True)
-class Placement:
-    """One explanation of the start: keyframe poses and beacon positions in the start frame, with their covariance.
-
-    Attributes:
-      poses: (N, 3); slots: placed beacons; beacons: (B, 2) [m]; cost: negative log-likelihood.
-      cov: joint covariance of poses and beacons in that order (3 N + 2 B).
-    """
-
-    poses: np.ndarray
-    slots: list[int]
-    beacons: np.ndarray
-    cost: float
-    cov: np.ndarray
-
-    def beacon_sigma(self) -> np.ndarray:
-        """(B,) largest standard deviation of each beacon's position [m]."""
-        n = self.poses.size
-        blocks = [self.cov[n + 2 * b : n + 2 * b + 2, n + 2 * b : n + 2 * b + 2] for b in range(len(self.slots))]
-        return np.array([np.sqrt(np.linalg.eigvalsh(block)[-1]) for block in blocks])
+def usable(ranges: Ranges, nlos_gap_db: float) -> np.ndarray:
+    """(M,) which ranges of a frame start-up may use: measured, and not NLOS by their powers."""
+    return np.asarray(ranges.valid) & ~(np.asarray(ranges.power_gap) > nlos_gap_db)
 
 
 @dataclass(frozen=True)
@@ -152,7 +118,7 @@ def solve(buffer: Buffer) -> Outcome:
     """Place the beacons if what is buffered determines them."""
     if buffer.extent < _MOVED_ENOUGH_M:
         return Outcome("waiting for motion", 0, 0.0, None)
-    problem = _Problem.build(buffer)
+    problem = Problem.build(buffer.keyframes, buffer.pairs, buffer.sigma_n)
     if len(problem.slots) < 2:
         return Outcome("placing beacons", 0, 0.0, None)
     first, second = problem.starts()
@@ -163,7 +129,7 @@ def solve(buffer: Buffer) -> Outcome:
     if mirrored.cost < best.cost:
         best, mirrored = mirrored, best
     margin = min(margin, _margin(best, mirrored))
-    if margin < _DECIDED:
+    if margin < DECIDED:
         return Outcome("reflection undecided", 2, margin, None)
     sure = problem.keep_sure(best)
     if len(sure.slots) < 2:
@@ -178,269 +144,138 @@ def _margin(best: Placement, other: Placement) -> float:
 
 
 @dataclass(frozen=True)
-class _Problem:
-    """The batch problem in arrays. N keyframes, B beacons, R averaged ranges, E pairs of beacons.
+class Adopted:
+    """A start-up that was decided.
 
-    steps (N-1, 3) relative poses with roots (N-1, 3, 3) of their information; at (R,) keyframe, to (R,) beacon index,
-    local (R, 2), distance (R,), sigma (R,); pair (E, 2) beacon indices, pair_distance (E,), pair_sigma (E,).
+    Attributes:
+      state: the estimator's state in the published frame.
+      anchors: (N,) stamps of the keyframes [ns]; before, after: (N, 3) their poses in the start frame and in the
+        published one. A pose of the start moves with the last keyframe before it.
     """
 
-    slots: list[int]
-    track: np.ndarray
-    steps: np.ndarray
-    roots: np.ndarray
-    at: np.ndarray
-    to: np.ndarray
-    local: np.ndarray
-    distance: np.ndarray
-    sigma: np.ndarray
-    pair: np.ndarray
-    pair_distance: np.ndarray
-    pair_sigma: np.ndarray
+    state: State
+    anchors: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
 
-    @staticmethod
-    def build(buffer: Buffer) -> _Problem:
-        keys = buffer.keyframes
-        heard: dict[int, int] = {}
-        for key in keys:
-            for slot in key.seen:
-                heard[slot] = heard.get(slot, 0) + 1
-        slots = sorted(slot for slot, count in heard.items() if count >= 3)
-        index = {slot: b for b, slot in enumerate(slots)}
-        rows = [(k, index[s], *_average(seen)) for k, key in enumerate(keys) for s, seen in key.seen.items() if s in index]
-        pairs = [(index[i], index[j], d) for (i, j), d in buffer.pairs.items() if i in index and j in index]
-        track = np.array([key.pose for key in keys])
-        steps, roots = _steps(keys)
-
-        def sigma(count):
-            return np.sqrt(buffer.sigma_n**2 / np.maximum(count, 1) + _RANGE_FLOOR_M**2)
-
-        return _Problem(
-            slots=slots,
-            track=track,
-            steps=steps,
-            roots=roots,
-            at=np.array([r[0] for r in rows], int),
-            to=np.array([r[1] for r in rows], int),
-            local=np.array([r[2] for r in rows]).reshape(-1, 2),
-            distance=np.array([r[3] for r in rows]),
-            sigma=sigma(np.array([r[4] for r in rows])),
-            pair=np.array([p[:2] for p in pairs], int).reshape(-1, 2),
-            pair_distance=np.array([np.median(p[2]) for p in pairs]),
-            # a median of n is as good as a mean of 0.64 n
-            pair_sigma=sigma(0.64 * np.array([len(p[2]) for p in pairs])),
-        )
-
-    def starts(self) -> tuple[np.ndarray, np.ndarray]:
-        """Beacon positions (B, 2) to start from: the sides that fit the beacons' own ranges best, and the mirror."""
-        antenna = self._antenna(self.track)
-        near, far = np.zeros((2, len(self.slots), 2))
-        for b in range(len(self.slots)):
-            mine = self.to == b
-            near[b], far[b] = multilaterate(antenna[mine], self.distance[mine], self.sigma[mine])
-        choice = self._consistent_sides(near, far)
-        return np.where(choice[:, None], far, near), np.where(choice[:, None], near, far)
-
-    def _consistent_sides(self, near: np.ndarray, far: np.ndarray) -> np.ndarray:
-        """For each beacon, whether its second candidate is the one that agrees with the ranges between beacons."""
-        count = len(self.slots)
-        if not len(self.pair):
-            return np.zeros(count, bool)
-        rng = np.random.default_rng(0)
-        best, best_cost = np.zeros(count, bool), np.inf
-        for trial in range(8):
-            choice = np.zeros(count, bool) if trial == 0 else rng.random(count) < 0.5
-            cost = self._pair_cost(np.where(choice[:, None], far, near))
-            improved = True
-            while improved:
-                improved = False
-                for b in range(count):
-                    choice[b] ^= True
-                    other = self._pair_cost(np.where(choice[:, None], far, near))
-                    if other < cost - 1e-9:
-                        cost, improved = other, True
-                    else:
-                        choice[b] ^= True
-            if cost < best_cost:
-                best, best_cost = choice.copy(), cost
-        return best
-
-    def _pair_cost(self, beacons: np.ndarray) -> float:
-        d = np.linalg.norm(beacons[self.pair[:, 0]] - beacons[self.pair[:, 1]], axis=1)
-        return float(np.abs(d - self.pair_distance).sum())
-
-    def _antenna(self, poses: np.ndarray) -> np.ndarray:
-        c, s = np.cos(poses[self.at, 2]), np.sin(poses[self.at, 2])
-        x, y = self.local.T
-        return poses[self.at, :2] + np.stack([c * x - s * y, s * x + c * y], -1)
-
-    def mirror(self, placement: Placement) -> np.ndarray:
-        """The beacons of a placement mirrored at the line that the robot's antenna drove best along."""
-        antenna = self._antenna(placement.poses)
-        _, _, axes = np.linalg.svd(antenna - antenna.mean(0), full_matrices=False)
-        normal = axes[1]
-        return placement.beacons - 2 * ((placement.beacons - antenna.mean(0)) @ normal)[:, None] * normal
-
-    def minimise(self, beacons: np.ndarray) -> Placement:
-        """Levenberg-Marquardt from given beacons and the track as it was driven; the first pose is held."""
-        poses, damping = self.track.copy(), 1e-3
-        J, r = self._linearise(poses, beacons)
-        cost = 0.5 * r @ r
-        for _ in range(30):
-            A, g = J.T @ J, J.T @ r
-            move = -np.linalg.solve(A + damping * np.diag(np.diag(A) + 1e-9), g)
-            new_poses = poses + move[: poses.size].reshape(-1, 3)
-            new_beacons = beacons + move[poses.size :].reshape(-1, 2)
-            new_J, new_r = self._linearise(new_poses, new_beacons)
-            new_cost = 0.5 * new_r @ new_r
-            if new_cost < cost:
-                done = cost - new_cost < 1e-4
-                poses, beacons, J, r, cost = new_poses, new_beacons, new_J, new_r, new_cost
-                damping = max(damping / 5, 1e-9)
-                if done:
-                    break
-            else:
-                damping *= 10
-                if damping > 1e6:
-                    break
-        cov = np.linalg.inv(J.T @ J + 1e-9 * np.eye(J.shape[1]))
-        return Placement(poses, self.slots, beacons, float(cost), cov)
-
-    def _linearise(self, poses: np.ndarray, beacons: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Whitened Jacobian (rows, 3 N + 2 B) and residuals of held start, steps, ranges and pairs."""
-        n, b = poses.size, beacons.size
-        blocks = [self._hold_start(poses, n + b), self._step_rows(poses, n + b)]
-        blocks += [self._range_rows(poses, beacons, n + b), self._pair_rows(poses, beacons, n + b)]
-        return np.concatenate([J for J, _ in blocks]), np.concatenate([r for _, r in blocks])
-
-    def _hold_start(self, poses, columns):
-        J = np.zeros((3, columns))
-        J[:, :3] = 1e4 * np.eye(3)
-        return J, 1e4 * (poses[0] - self.track[0])
-
-    def _step_rows(self, poses, columns):
-        m = len(self.steps)
-        J, r = np.zeros((m, 3, columns)), np.zeros((m, 3))
-        for k in range(m):
-            R = _rotation(poses[k, 2]).T
-            u = poses[k + 1, :2] - poses[k, :2]
-            e = np.append(R @ u, poses[k + 1, 2] - poses[k, 2]) - self.steps[k]
-            local = np.zeros((3, 6))
-            local[:2, :2], local[:2, 3:5] = -R, R
-            local[:2, 2] = -R @ np.array([-u[1], u[0]])
-            local[2, 2], local[2, 5] = -1.0, 1.0
-            J[k, :, 3 * k : 3 * k + 6] = self.roots[k] @ local
-            r[k] = self.roots[k] @ e
-        return J.reshape(-1, columns), r.ravel()
-
-    def _range_rows(self, poses, beacons, columns):
-        antenna = self._antenna(poses)
-        u = antenna - beacons[self.to]
-        d = np.maximum(np.linalg.norm(u, axis=1), 1e-6)
-        unit = u / d[:, None]
-        lever = antenna - poses[self.at, :2]
-        r, scale = _soften((d - self.distance) / self.sigma)
-        weight = scale / self.sigma
-        rows, J = np.arange(len(d)), np.zeros((len(d), columns))
-        for axis in range(2):
-            J[rows, 3 * self.at + axis] = weight * unit[:, axis]
-            J[rows, poses.size + 2 * self.to + axis] = -weight * unit[:, axis]
-        J[rows, 3 * self.at + 2] = weight * (unit[:, 1] * lever[:, 0] - unit[:, 0] * lever[:, 1])
-        return J, r
-
-    def _pair_rows(self, poses, beacons, columns):
-        i, j = self.pair.T
-        u = beacons[i] - beacons[j]
-        d = np.maximum(np.linalg.norm(u, axis=1), 1e-6)
-        r, scale = _soften((d - self.pair_distance) / self.pair_sigma)
-        weight = (scale / self.pair_sigma / d)[:, None] * u
-        rows, J = np.arange(len(d)), np.zeros((len(d), columns))
-        for axis in range(2):
-            J[rows, poses.size + 2 * i + axis] = weight[:, axis]
-            J[rows, poses.size + 2 * j + axis] = -weight[:, axis]
-        return J, r
-
-    def keep_sure(self, best: Placement) -> Placement:
-        """The placement without the beacons whose position is uncertain or has a second place as good."""
-        sigma = best.beacon_sigma()
-        antenna = self._antenna(best.poses)
-        sure = []
-        for b in range(len(self.slots)):
-            mine = self.to == b
-            spots = np.stack(multilaterate(antenna[mine], self.distance[mine], self.sigma[mine]))
-            away = spots[np.argmax(np.linalg.norm(spots - best.beacons[b], axis=1))]
-            moved = best.beacons.copy()
-            moved[b] = away
-            _, r = self._linearise(best.poses, moved)
-            unique = np.linalg.norm(away - best.beacons[b]) < 4 * sigma[b] or 0.5 * r @ r - best.cost > _DECIDED
-            sure.append(bool(unique and sigma[b] < _SIGMA_ENOUGH_M))
-        kept = [b for b, ok in enumerate(sure) if ok]
-        n = best.poses.size
-        columns = np.concatenate([np.arange(n), *[n + 2 * b + np.arange(2) for b in kept]]).astype(int)
-        return Placement(
-            best.poses, [best.slots[b] for b in kept], best.beacons[kept], best.cost, best.cov[np.ix_(columns, columns)]
-        )
+    def republish(self, stamps: np.ndarray, poses: np.ndarray) -> np.ndarray:
+        """Poses (T, 3) of the start frame, taken at stamps (T,), in the published frame."""
+        at = np.clip(np.searchsorted(self.anchors, stamps, side="right") - 1, 0, len(self.anchors) - 1)
+        return compose(self.after[at], between(self.before[at], poses))
 
 
-def multilaterate(anchors: np.ndarray, distance: np.ndarray, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The best and the second-best place of one node, from ranges to known points; the same place twice where there
-    is no second.
+def adopt(
+    config: Config,
+    params: Params,
+    state: State,
+    buffer: Buffer,
+    placement: Placement,
+    frame_slots: tuple[int, int],
+) -> Adopted:
+    """The state in the paper's frame (one beacon at the origin, another on +x), its covariance carried along.
 
     Args:
-      anchors: (R, 2) [m]; distance, sigma: (R,) [m].
+      state: of the LiDAR-only run in the start frame.
+      frame_slots: slots of the two beacons that make the frame.
     """
-    first = np.argmin(sigma)
-    angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    spots = anchors[first] + distance[first] * np.stack([np.cos(angle), np.sin(angle)], -1)
-    cost = np.zeros(len(spots))
-    for _ in range(12):  # Gauss-Newton from every start at once
-        u = spots[:, None] - anchors
-        d = np.maximum(np.linalg.norm(u, axis=2), 1e-6)
-        r, scale = _soften((d - distance) / sigma)
-        J = (scale / sigma / d)[..., None] * u
-        A = np.einsum("sri,srj->sij", J, J) + 1e-3 * np.eye(2)
-        move = np.linalg.solve(A, np.einsum("sri,sr->si", J, r)[..., None])[..., 0]
-        spots = spots - np.clip(move, -2.0, 2.0)
-        cost = 0.5 * (r**2).sum(1)
-    order = np.argsort(cost)
-    best = spots[order[0]]
-    apart = [k for k in order if np.linalg.norm(spots[k] - best) > 0.5]
-    return best, spots[apart[0]] if apart else best
+    before = np.array([key.pose for key in buffer.keyframes])
+    pose = np.asarray(layout.robot_pose(state.belief.mean), float)
+    onward = between(before[-1], pose)
+    x = np.concatenate([placement.poses[-1], placement.beacons.ravel()])
+    n, last = placement.poses.size, placement.poses.size - 3
+    at = np.concatenate([np.arange(last, n), np.arange(n, len(placement.cov))])
+    y = partial(_published, slots=placement.slots, frame_slots=frame_slots, onward=onward)
+    J = _numeric_jacobian(y, x)
+    cov = J @ placement.cov[np.ix_(at, at)] @ J.T
+    motion = _frame_motion(placement.beacons, placement.slots, frame_slots)
+    after = compose(motion, placement.poses)
+    belief = _belief(state.belief, config.nodes, y(x), cov, placement.slots, pose)
+    active = jnp.zeros(config.nodes, bool).at[jnp.array([0, *placement.slots])].set(True)
+    grid = _redraw(config, params, buffer.keyframes, after, y(x)[:2])
+    adopted = state._replace(belief=belief, active=active, grid=grid, drawn_pose=jnp.asarray(y(x)[:3], jnp.float32))
+    return Adopted(adopted, np.array([key.frame.stamp for key in buffer.keyframes]), before, after)
 
 
-def _average(seen: list[tuple[np.ndarray, float]]) -> tuple[np.ndarray, float, int]:
-    """Mean place, distance and count of the ranges near one keyframe, without the ones far from their median."""
-    local = np.array([s[0] for s in seen])
-    distance = np.array([s[1] for s in seen])
-    ok = np.abs(distance - np.median(distance)) < 0.5
-    return local[ok].mean(0), float(distance[ok].mean()), int(ok.sum())
+def _frame_motion(beacons: np.ndarray, slots: list[int], frame_slots: tuple[int, int]) -> np.ndarray:
+    origin, along = (beacons[slots.index(s)] for s in frame_slots)
+    theta = -np.arctan2(along[1] - origin[1], along[0] - origin[0])
+    return np.append(-rotation(theta) @ origin, theta)
 
 
-def _steps(keys: list[Keyframe]) -> tuple[np.ndarray, np.ndarray]:
-    """Relative poses of consecutive keyframes and the roots of their information, in the earlier one's frame."""
-    steps, roots = np.zeros((len(keys) - 1, 3)), np.zeros((len(keys) - 1, 3, 3))
-    for k, (a, b) in enumerate(zip(keys, keys[1:], strict=False)):
-        R = _rotation(a.pose[2]).T
-        u = b.pose - a.pose
-        steps[k] = np.append(R @ u[:2], u[2])
-        turn = np.eye(3)
-        turn[:2, :2] = R
-        length = np.hypot(*u[:2])
-        # where the match says nothing, the motion model still bounds the step; where it says much, the map it was
-        # matched with has its own drift
-        loose = np.diag([0.1 + 0.2 * length, 0.1 + 0.2 * length, 0.05 + 0.1 * abs(u[2])]) ** 2
-        tight = np.diag([0.005 + 0.01 * length, 0.005 + 0.01 * length, 0.002 + 0.01 * abs(u[2])]) ** 2
-        cov = np.linalg.inv(turn @ b.information @ turn.T + np.linalg.inv(loose)) + tight
-        roots[k] = np.linalg.cholesky(np.linalg.inv(cov)).T
-    return steps, roots
+def _published(x: np.ndarray, *, slots, frame_slots, onward) -> np.ndarray:
+    """Robot pose now and beacons in the published frame, from the last keyframe and beacons in the start frame."""
+    beacons = x[3:].reshape(-1, 2)
+    motion = _frame_motion(beacons, slots, frame_slots)
+    robot = compose(motion, compose(x[:3], onward))
+    return np.concatenate([robot, (beacons @ rotation(motion[2]).T + motion[:2]).ravel()])
 
 
-def _soften(whitened: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Residual whose half square is the Geman-McClure loss, and its derivative."""
-    inside = 1.0 + (whitened / _SOFT) ** 2
-    return whitened / np.sqrt(inside), inside**-1.5
+def _numeric_jacobian(function, x: np.ndarray) -> np.ndarray:
+    h = 1e-6
+    columns = [(function(x + h * e) - function(x - h * e)) / (2 * h) for e in np.eye(len(x))]
+    return np.stack(columns, axis=1)
 
 
-def _rotation(theta: float) -> np.ndarray:
-    c, s = np.cos(theta), np.sin(theta)
-    return np.array([[c, -s], [s, c]])
+def _belief(
+    belief: Gaussian, nodes: int, values: np.ndarray, cov: np.ndarray, slots: list[int], old_pose: np.ndarray
+) -> Gaussian:
+    """State vector and covariance from robot pose and beacons; velocities turn with the frame.
+
+    The map is drawn at the estimated poses, so its error is that of the pose with the other sign: a match then
+    reports what the track already says, and only the ranges can tell the two apart.
+    """
+    mean, P = np.array(belief.mean, float), np.array(belief.cov, float)
+    pose, error = np.array(layout.pose_indices(nodes)), np.array(layout.map_error_indices(nodes))
+    velocity, beacon_velocities = np.arange(2 * nodes, 2 * nodes + 2), np.arange(2 * nodes + 2, 4 * nodes)
+    placed = np.concatenate([[2 * s, 2 * s + 1] for s in slots])
+    R = rotation(values[2] - old_pose[2])
+    mean[velocity] = R @ mean[velocity]
+    motion_cov = P[np.ix_([*velocity, 4 * nodes + 1], [*velocity, 4 * nodes + 1])]
+    motion_cov[:2] = R @ motion_cov[:2]
+    motion_cov[:, :2] = motion_cov[:, :2] @ R.T
+    P = np.eye(len(mean))
+    P[beacon_velocities, beacon_velocities] = 1e-8
+    P[np.ix_([*velocity, 4 * nodes + 1], [*velocity, 4 * nodes + 1])] = motion_cov
+    known = np.concatenate([pose, placed])
+    P[np.ix_(known, known)] = cov
+    P[np.ix_(error, known)] = -cov[:3]
+    P[np.ix_(known, error)] = -cov[:, :3]
+    P[np.ix_(error, error)] = cov[:3, :3]
+    mean[pose], mean[placed], mean[error] = values[:3], values[3:], 0.0
+    return Gaussian(jnp.asarray(mean, jnp.float32), jnp.asarray(P, jnp.float32))
+
+
+def _redraw(config: Config, params: Params, keys: list[Keyframe], poses: np.ndarray, middle: np.ndarray):
+    """A fresh window over the robot with every keyframe's scan drawn at its pose."""
+    grid = occupancy.empty(config.cells, config.levels, config.resolution)
+    side = TILE * config.resolution
+    corner = np.round((middle - config.cells * config.resolution / 2) / side) * side
+    grid = grid._replace(origin=jnp.asarray(corner, jnp.float32))
+    for key, pose in zip(keys, poses, strict=True):
+        if bool(key.frame.frame.has_scan):
+            drift = jnp.asarray(rotation(-key.pose[2]) @ key.velocity, jnp.float32)
+            grid = _draw_one(
+                config, params, grid, jnp.asarray(pose, jnp.float32), key.frame.frame.scan, drift, np.float32(key.yaw_rate)
+            )
+    return grid
+
+
+@partial(jax.jit, static_argnums=0)
+def _draw_one(config: Config, params: Params, grid: occupancy.Grid, pose, scan: Scan, drift, yaw_rate):
+    sweep = slam.undo_motion(scan, params.lidar, drift, yaw_rate)
+    return occupancy.integrate(grid, pose, sweep, config.resolution)
+
+
+def compose(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Host version of geometry.compose for (..., 3) poses in float64; headings are not wrapped."""
+    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    x = a[..., 0] + c * b[..., 0] - s * b[..., 1]
+    y = a[..., 1] + s * b[..., 0] + c * b[..., 1]
+    return np.stack([x, y, a[..., 2] + b[..., 2]], axis=-1)
+
+
+def between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Host version of geometry.between for (..., 3) poses in float64; headings are not wrapped."""
+    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    dx, dy = b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]
+    return np.stack([c * dx + s * dy, -s * dx + c * dy, b[..., 2] - a[..., 2]], axis=-1)

@@ -1,0 +1,175 @@
+"""One run of the estimator over frames: the compiled step, and the host's slow loop around it.
+
+Every CONTROL_EVERY frames the host looks at what the steps reported: it decides the start-up, places beacons that
+joined, drops those that fell silent, and moves the map's window. The steps in between run without it, one by one
+(online) or as one compiled scan (batch); both give the same bits.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from uwbslam_jax import slam, startup
+from uwbslam_jax.beacons import BeaconKeeper
+from uwbslam_jax.config import Settings, make_config, make_params
+from uwbslam_jax.history import History
+from uwbslam_jax.measurements import Frame, StampedFrame
+from uwbslam_jax.slam import Estimate, State
+from uwbslam_jax.startup import Buffer
+from uwbslam_jax.tiles import Tiles
+
+CONTROL_EVERY = 10
+"""Frames between two looks of the host."""
+_SOLVE_EVERY_S = 1.0
+"""The start-up problem is solved at most this often, in the log's time."""
+
+TRACES: Counter[str] = Counter()
+"""How often each compiled function was traced, by name; a test counts them."""
+
+
+@partial(jax.jit, static_argnums=0, donate_argnums=2)
+def step_once(config, params, state: State, frame: Frame) -> tuple[State, Estimate]:
+    """One compiled step; the state's buffers are reused."""
+    TRACES["step_once"] += 1
+    return _guarded(config, params, state, frame)
+
+
+@partial(jax.jit, static_argnums=0, donate_argnums=2)
+def step_many(config, params, state: State, frames: Frame) -> tuple[State, Estimate]:
+    """Steps over frames stacked along their first axis, as one compiled scan."""
+    TRACES["step_many"] += 1
+    return lax.scan(lambda s, f: _guarded(config, params, s, f), state, frames)
+
+
+def _guarded(config, params, state, frame):
+    # without the barriers the compiler fuses the step with the loop around it and rounds differently there
+    state, frame = lax.optimization_barrier((state, frame))
+    return lax.optimization_barrier(slam.step(config, params, state, frame))
+
+
+class Session:
+    """A run in progress.
+
+    Attributes:
+      settings, config, params: what it runs with; params grow biases and heights as ids get slots.
+      state: the estimator's.
+      decided_at: stamp of the frame at which the published frame was decided, None before [ns].
+      status: of the start-up, in words.
+      history: what was reported so far.
+    """
+
+    def __init__(self, settings: Settings):
+        self.settings = settings
+        self.config = make_config(settings)
+        self.params = make_params(settings)
+        self.state = slam.init(self.config)
+        self.tiles = Tiles(settings.map.resolution)
+        self.history = History()
+        self.decided_at: int | None = None
+        self.status = "LiDAR only" if settings.filter.lidar_only else "waiting for motion"
+        self.hypotheses = 0
+        self._slots: dict[int, int] = {settings.robot.id: 0}
+        self._pending: list[tuple[StampedFrame, Estimate]] = []
+        self._solved_at = 0
+        self._buffer = self._new_buffer()
+        self._keeper = BeaconKeeper(settings)
+
+    @property
+    def slots(self) -> dict[int, int]:
+        """Node id -> slot, as far as heard."""
+        return self._slots
+
+    def room(self) -> int:
+        """How many more frames may be stepped before the host has to look."""
+        return CONTROL_EVERY - len(self._pending)
+
+    def step(self, frame: StampedFrame) -> Estimate:
+        """One frame in, its estimate out (numpy)."""
+        self._learn_slots(frame)
+        self.state, estimate = step_once(self.config, self.params, self.state, frame.frame)
+        estimate = jax.device_get(estimate)
+        self._take(frame, estimate)
+        return estimate
+
+    def steps(self, frames: Sequence[StampedFrame]) -> list[Estimate]:
+        """The same for as many frames as there is room for, as one compiled scan."""
+        if len(frames) != CONTROL_EVERY or self._pending:
+            return [self.step(frame) for frame in frames]
+        self._learn_slots(frames[-1])
+        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *[f.frame for f in frames])
+        self.state, many = step_many(self.config, self.params, self.state, stacked)
+        many = jax.device_get(many)
+        estimates = [jax.tree.map(lambda leaf, k=k: leaf[k], many) for k in range(len(frames))]
+        for frame, estimate in zip(frames, estimates, strict=True):
+            self._take(frame, estimate)
+        return estimates
+
+    def _learn_slots(self, frame: StampedFrame) -> None:
+        if len(frame.slots) > len(self._slots):
+            self._slots = dict(frame.slots)
+            self.params = make_params(self.settings, self._slots)
+            self._buffer.height, self._buffer.bias = np.asarray(self.params.height), np.asarray(self.params.bias)
+
+    def _new_buffer(self) -> Buffer:
+        p = self.params
+        return Buffer(np.asarray(p.antenna, float), np.asarray(p.height), np.asarray(p.bias), float(p.sigma_n))
+
+    def _take(self, frame: StampedFrame, estimate: Estimate) -> None:
+        self.history.add(frame, estimate, self.hypotheses)
+        self._pending.append((frame, estimate))
+        if len(self._pending) == CONTROL_EVERY:
+            self._look()
+
+    def _look(self) -> None:
+        pending, self._pending = self._pending, []
+        if not self.settings.filter.lidar_only:
+            if self.decided_at is None:
+                self._start_up(pending)
+            else:
+                self._keep_beacons(pending)
+        robot = np.asarray(self.state.belief.mean[:2], float)
+        origin = np.asarray(self.state.grid.origin, float)
+        if self.tiles.needs_move(origin, self.config.cells, robot):
+            self.state = self.state._replace(grid=self.tiles.recentre(self.state.grid, robot))
+
+    def _start_up(self, pending: list[tuple[StampedFrame, Estimate]]) -> None:
+        for frame, estimate in pending:
+            self._buffer.add(frame, estimate, startup.usable(frame.frame.ranges, self.config.nlos_gap_db))
+        now = pending[-1][0].stamp
+        if now - self._solved_at < _SOLVE_EVERY_S * 1e9:
+            return
+        self._solved_at = now
+        outcome = startup.solve(self._buffer)
+        if outcome.status != self.status:
+            self.history.event(now, outcome.status)
+        self.status, self.hypotheses = outcome.status, outcome.hypotheses
+        if outcome.placement is None:
+            return
+        ids = {slot: node for node, slot in self._slots.items()}
+        origin, along = sorted(outcome.placement.slots, key=lambda slot: ids[slot])[:2]
+        adopted = startup.adopt(self.config, self.params, self.state, self._buffer, outcome.placement, (origin, along))
+        self.state, self.decided_at = adopted.state, now
+        self.tiles.clear()
+        self.history.republish(adopted)
+        self.history.event(now, f"frame decided by beacons {ids[origin]} and {ids[along]}")
+        for slot in outcome.placement.slots:
+            self._keeper.placed(slot, now)
+            self.history.event(now, f"beacon {ids[slot]} placed")
+        self._buffer = self._new_buffer()
+
+    def _keep_beacons(self, pending: list[tuple[StampedFrame, Estimate]]) -> None:
+        ids = {slot: node for node, slot in self._slots.items()}
+        self.state, events = self._keeper.look(self.state, self.params, pending)
+        for slot, text in events:
+            self.history.event(pending[-1][0].stamp, f"beacon {ids[slot]} {text}")
+
+    def beacon_status(self, slot: int) -> str:
+        """static, moving, silent, dropped or waiting."""
+        return self._keeper.status(slot)
