@@ -37,10 +37,12 @@ def pair_residuals(result: Result) -> dict[tuple[int, int], np.ndarray]:
     """Finite residuals [m] of each pair of nodes, the smaller id first."""
     rows = result.range_residuals.reshape(-1, 4)
     rows = rows[np.isfinite(rows).all(axis=1)]
+    if not len(rows):
+        return {}
     nodes = np.sort(rows[:, 1:3].astype(np.int64), axis=1)
     pairs, which, counts = np.unique(nodes, axis=0, return_inverse=True, return_counts=True)
     groups = np.split(rows[np.argsort(which.ravel(), kind="stable"), 3], np.cumsum(counts)[:-1])
-    return {(int(a), int(b)): group for (a, b), group in zip(pairs, groups, strict=bool(len(pairs)))}
+    return {(int(a), int(b)): group for (a, b), group in zip(pairs, groups, strict=True)}
 
 
 def pair_kinds(result: Result, pairs: Iterable[tuple[int, int]]) -> dict[tuple[int, int], int]:
