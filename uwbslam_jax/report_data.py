@@ -189,5 +189,5 @@ def _png(pixels: np.ndarray) -> bytes:
 
     header = struct.pack(">IIBBBBB", cols, rows, 8, 4, 0, 0, 0)  # 8 bits a sample, grey and alpha
     lines = np.concatenate([np.zeros((rows, 1), np.uint8), pixels.reshape(rows, -1)], axis=1)  # filter 0 each
-    body = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(lines.tobytes(), 9)) + chunk(b"IEND", b"")
+    body = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(lines.tobytes(), 6)) + chunk(b"IEND", b"")
     return b"\x89PNG\r\n\x1a\n" + body
