@@ -48,7 +48,7 @@ def corner_log_odds(
     One gather of 2 x 2 windows: on a CPU it is 3 to 4 times faster than four gathers.
     """
     cells = level.shape[0]
-    u = (points - origin) / size - 0.5
+    u = (points - origin[None]) / size - 0.5
     corner = jnp.floor(u)
     inside = jnp.all((corner >= 0) & (corner <= cells - 2), axis=-1)
     corner = jnp.clip(corner, 0, cells - 2)
@@ -135,7 +135,7 @@ def _integrate_level(level, origin, size, ends, sensor, yaw, sweep):
     free = _passed(bearing, distance, yaw, size, sweep)
     block = jnp.where(free, block + FREE, block)
     freed = lax.dynamic_update_slice(level, block, (start[1], start[0]))
-    cell = jnp.floor((ends - origin) / size).astype(jnp.int32)
+    cell = jnp.floor((ends - origin[None]) / size).astype(jnp.int32)
     inside = sweep.valid & jnp.all((cell >= 0) & (cell < cells), axis=-1)
     row, col = jnp.where(inside, cell[:, 1], cells), jnp.where(inside, cell[:, 0], cells)
     clipped = jnp.clip(cell, 0, cells - 1)

@@ -23,7 +23,8 @@ class History:
       diagnostics: one entry a frame by name.
       residuals: (t, slot, slot, measured minus predicted); tracks: (t, slot, x, y, sigma).
       events: (stamp, text).
-      rejected: ranges not used, by reason.
+      beacons: slot -> position (2,) [m] and covariance (2, 2) [m^2] when it was last in the state.
+      last_scan: number, frame and estimate of the last frame that had a scan.
     """
 
     def __init__(self) -> None:
@@ -35,8 +36,8 @@ class History:
         self.residuals: list[tuple[int, int, int, float]] = []
         self.tracks: list[tuple[int, int, float, float, float]] = []
         self.events: list[tuple[int, str]] = []
-        self.last: tuple[StampedFrame, Estimate] | None = None
-        self.step_ms: list[float] = []
+        self.beacons: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self.last_scan: tuple[int, StampedFrame, Estimate] | None = None
         self._residuals_at = self._tracks_at = 0
 
     def add(self, frame: StampedFrame, estimate: Estimate, hypotheses: int) -> None:
@@ -72,7 +73,10 @@ class History:
                 x, y = estimate.beacons[slot]
                 sigma = float(np.sqrt(max(np.linalg.eigvalsh(estimate.beacon_covs[slot])[-1], 0.0)))
                 self.tracks.append((frame.stamp, int(slot), float(x), float(y), sigma))
-        self.last = (frame, estimate)
+        for slot in np.flatnonzero(estimate.active[1:]) + 1:
+            self.beacons[int(slot)] = (estimate.beacons[slot], estimate.beacon_covs[slot])
+        if frame.frame.has_scan:
+            self.last_scan = (len(self.stamps) - 1, frame, estimate)
 
     def event(self, stamp: int, text: str) -> None:
         """Something worth telling happened."""

@@ -115,7 +115,7 @@ def search(
     def scores(heading):
         c, s = jnp.cos(heading), jnp.sin(heading)
         turned = jnp.stack([c * points[:, 0] - s * points[:, 1], s * points[:, 0] + c * points[:, 1]], axis=-1)
-        ends = (turned[None] + prior.mean[:2] + offsets[:, None]).reshape(-1, 2)
+        ends = (turned[None] + (prior.mean[None, :2] + offsets)[:, None]).reshape(-1, 2)
         corners, at, inside = occupancy.corner_log_odds(grid.levels[k], grid.origin, size, ends)
         value, _ = occupancy.interpolate(jax.nn.sigmoid(corners), at, size)
         gain = jnp.where(inside, value - 0.5, 0.0).reshape(offsets.shape[0], -1)
@@ -124,7 +124,7 @@ def search(
     table = jax.lax.map(scores, headings, batch_size=8)  # (headings, offsets)
     best_offset = jnp.argmax(table, axis=1)
     _, best = jax.lax.top_k(jnp.max(table, axis=1), _SEARCH_REFINED)
-    starts = jnp.concatenate([prior.mean[:2] + offsets[best_offset[best]], headings[best, None]], axis=1)
+    starts = jnp.concatenate([prior.mean[None, :2] + offsets[best_offset[best]], headings[best, None]], axis=1)
 
     def refine(start):
         wide = Gaussian(start, prior.cov * 0 + jnp.diag(jnp.array([0.3, 0.3, 0.3]) ** 2))

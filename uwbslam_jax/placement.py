@@ -298,7 +298,8 @@ def _average(seen: list[tuple[np.ndarray, float]]) -> tuple[np.ndarray, float, i
     """Mean place, distance and count of the ranges near one keyframe, without the ones far from their median."""
     local = np.array([s[0] for s in seen])
     distance = np.array([s[1] for s in seen])
-    ok = np.abs(distance - np.median(distance)) < 0.5
+    middle = np.sort(distance)[len(distance) // 2]  # one of them, so that at least one is near it
+    ok = np.abs(distance - middle) < 0.5
     return local[ok].mean(0), float(distance[ok].mean()), int(ok.sum())
 
 

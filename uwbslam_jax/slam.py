@@ -37,6 +37,8 @@ _DRAW_MOVED = (0.1, 0.05)
 """A scan is drawn when the robot has moved or turned this much since the last one [m, rad]."""
 _DRAW_FIRST = 10
 """The first scans are all drawn: there is no map yet to be blurred."""
+_NEW_GROUND = 0.02
+"""Share of new ground in a scan from which on it is drawn where the ranges say, not where the old map says."""
 _DRAW_PULL = (0.015, 0.0026)
 """New ground is drawn at most this far from the match towards the fused pose [m, rad]."""
 
@@ -216,7 +218,7 @@ def _draw(config, state, match, sweep, trusted):
     wanted = trusted & (moved | turned | (state.scans_drawn < _DRAW_FIRST))
     novelty = _novelty(config, state.grid, sweep, match.pose)
     limit = jnp.array([_DRAW_PULL[0], _DRAW_PULL[0], _DRAW_PULL[1]])
-    pose = match.pose - jnp.clip(0.5 * s.map_error, -limit, limit)
+    pose = match.pose - jnp.minimum(1.0, novelty / _NEW_GROUND) * jnp.clip(s.map_error, -limit, limit)
     levels = lax.cond(
         wanted, lambda g: occupancy.integrate(g, pose, sweep, config.resolution), lambda g: g, state.grid
     )
