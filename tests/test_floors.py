@@ -23,8 +23,9 @@ FLOORS: dict[float, str] = {
     6: "startup beacons",
     6.1: "history",
     6.2: "session",
-    7: "online batch report_data",
+    7: "run report_data",
     8: "tuning simulate report outputs",
+    8.1: "commands",
     9: "__main__",
 }
 FLOOR = {module: floor for floor, modules in FLOORS.items() for module in modules.split()}
@@ -65,6 +66,6 @@ from .ekf import Gaussian
 if TYPE_CHECKING:
     from uwbslam_jax.result import Result
 def late():
-    from uwbslam_jax.online import run
+    from uwbslam_jax.run import run_log
 """
-    assert imported_modules(source) == {"grid", "slam", "matching", "ekf", "result", "online"}
+    assert imported_modules(source) == {"grid", "slam", "matching", "ekf", "result", "run"}

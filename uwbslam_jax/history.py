@@ -74,7 +74,7 @@ class History:
                 sigma = float(np.sqrt(max(np.linalg.eigvalsh(estimate.beacon_covs[slot])[-1], 0.0)))
                 self.tracks.append((frame.stamp, int(slot), float(x), float(y), sigma))
         for slot in np.flatnonzero(estimate.active[1:]) + 1:
-            self.beacons[int(slot)] = (estimate.beacons[slot], estimate.beacon_covs[slot])
+            self.beacons[int(slot)] = (np.asarray(estimate.beacons[slot]), np.asarray(estimate.beacon_covs[slot]))
         if frame.frame.has_scan:
             self.last_scan = (len(self.stamps) - 1, frame, estimate)
 

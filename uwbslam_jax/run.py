@@ -47,9 +47,9 @@ class CompileClock:
     def __init__(self) -> None:
         self.seconds = 0.0
 
-    def _listen(self, event: str, duration: float, **_: Any) -> None:
+    def _listen(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
         if event.startswith("/jax/core/compile/"):
-            self.seconds += duration
+            self.seconds += duration_secs
 
     def __enter__(self) -> CompileClock:
         jax.monitoring.register_event_duration_secs_listener(self._listen)
@@ -187,7 +187,9 @@ def run_log(
     return runner.result(facts), runner.truth()
 
 
-def run_messages(messages: Iterable[Message], settings: Settings, *, online: bool = False) -> tuple[Result, Truth | None]:
+def run_messages(
+    messages: Iterable[Message], settings: Settings, *, online: bool = False
+) -> tuple[Result, Truth | None]:
     """The same for messages in memory, as a recorder got them; iterated twice."""
     begin = time.perf_counter()
     settings = fit_beams(settings, messages)

@@ -1,0 +1,86 @@
+"""The command line: finds the command, runs it, and turns what goes wrong into one line and an exit status.
+
+The commands are in `commands`; it is imported only once one is called, because JAX takes a second to load.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from uwbslam_jax import __version__
+
+COMMANDS = {
+    "demo": "simulate a robot in a workshop, run the recording, and report",
+    "run": "run a recording: track, beacons, map and report into a folder",
+    "simulate": "write a recording of a ready-made scenario, with ground truth",
+    "evaluate": "compare a run's folder with ground truth",
+    "inspect": "tell what a recording holds",
+}
+"""Name -> what it does, in a line."""
+
+BAD_INPUT = 2
+INTERRUPTED = 130
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs a command. Returns the exit status: 0, 2 for a bad log, setting, file or usage, 130 after Ctrl-C."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if not words or words[0] in ("-h", "--help"):
+        print(usage())
+        return 0 if words else BAD_INPUT
+    if words[0] == "--version":
+        print(f"uwbslam {__version__}")
+        return 0
+    if words[0] not in COMMANDS:
+        near = difflib.get_close_matches(words[0], COMMANDS, 1)
+        hint = f", did you mean {near[0]}?" if near else f"; there are {', '.join(COMMANDS)}"
+        return _fail(f"no command {words[0]}{hint}")
+    try:
+        _keep_compiled()
+        from uwbslam_jax import commands
+
+        return _guarded(commands, words)
+    except KeyboardInterrupt:
+        print("uwbslam: interrupted", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _guarded(commands, words: list[str]) -> int:
+    try:
+        commands.call(words[0], words[1:])
+    except BrokenPipeError:  # whoever reads our output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except commands.USER_ERRORS as error:
+        return _fail(f"{error.filename}: {error.strerror}" if _names_file(error) else str(error))
+    return 0
+
+
+def _names_file(error: BaseException) -> bool:
+    return isinstance(error, OSError) and error.filename is not None and error.strerror is not None
+
+
+def _fail(text: str) -> int:
+    print(f"uwbslam: {' '.join(text.split())}", file=sys.stderr)
+    return BAD_INPUT
+
+
+def _keep_compiled() -> None:
+    """Compiled programs are kept in the user's cache folder: the second run starts in seconds."""
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "uwbslam_jax" / "jax"
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache))
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
+
+
+def usage() -> str:
+    """The help of the whole program."""
+    lines = [f"  {name:<10} {about}" for name, about in COMMANDS.items()]
+    head = "usage: uwbslam COMMAND ...\n\nSLAM from LiDAR scans and UWB ranges, without prior knowledge.\n"
+    return "\n".join([head, "commands:", *lines, "", "uwbslam COMMAND --help tells a command's options."])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,305 @@
+"""What each command of the command line does: options, files, progress and figures. All printing is here.
+
+Every key of the settings is a flag of `run` (--uwb.sigma-n 0.1); a flag goes before the file given by --config.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+import zipfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from tqdm import tqdm
+from tyro.conf import Positional, arg
+
+from uwbslam_jax import config
+from uwbslam_jax.config import ConfigError, Settings
+from uwbslam_jax.log_summary import format_summary, inspect
+from uwbslam_jax.mcap_log import LogError, LogReader, LogWriter
+from uwbslam_jax.measurements import Message, ScanMessage, TruthMessage
+from uwbslam_jax.metrics import Truth, evaluate
+from uwbslam_jax.outputs import RunError, read_run, write_result
+from uwbslam_jax.report import write_report
+from uwbslam_jax.result import Result
+from uwbslam_jax.run import run_log
+from uwbslam_jax.simulate import SCENARIOS, Scenario, scenario, settings_overrides, simulate
+
+
+class UsageError(ValueError):
+    """A request that cannot be met; the message is one line."""
+
+
+USER_ERRORS = (LogError, ConfigError, RunError, UsageError, OSError)
+"""What a user can mend; the command line tells these in one line. Anything else is a defect of ours."""
+
+
+@dataclass
+class RunOptions:
+    """Run a recording; its track, beacons, map, summary and report go into a folder."""
+
+    log: Positional[Path]
+    """MCAP recording, or a ROS 2 bag folder with one."""
+    out: Annotated[Path, arg(aliases=["-o"])]
+    """Folder for the files; it is created."""
+    config: Path | None = None
+    """Settings in TOML; flags go before it."""
+    no_odom: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Leave odometry out, short for --odom.no-use."""
+    lidar_only: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Leave the ranges out, short for --filter.lidar-only."""
+    online: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Step frame by frame as on the robot; the same result, more slowly."""
+    quiet: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """No progress bar."""
+    settings: Annotated[Settings, arg(name="")] = field(default_factory=Settings)
+
+
+@dataclass
+class DemoOptions:
+    """Simulate a robot in a workshop with five beacons, run the recording, and report how far off the answer is."""
+
+    seed: int = 0
+    """Another seed is another workshop."""
+    duration: float = 150.0
+    """Length of the recording [s]."""
+    out: Annotated[Path, arg(aliases=["-o"])] = Path("uwbslam-demo")
+    """Folder for the recording and the files of the run; it is created."""
+    quiet: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """No progress bars."""
+
+
+@dataclass
+class SimulateOptions:
+    """Write a recording of a ready-made scenario, with ground truth, and the settings that fit its robot, if any."""
+
+    name: Positional[str]
+    """The scenario."""
+    out: Annotated[Path, arg(aliases=["-o"])]
+    """The recording (.mcap); settings go beside it (.toml)."""
+    seed: int = 0
+    """Another seed is another world."""
+    duration: float | None = None
+    """Length of the recording [s]; the scenario's own where not given."""
+    quiet: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """No progress bar."""
+
+
+@dataclass
+class EvaluateOptions:
+    """Compare a run with ground truth, after one rigid motion that lays robot and beacons together over it."""
+
+    directory: Positional[Path]
+    """Folder that `uwbslam run` wrote."""
+    truth: Positional[Path]
+    """Recording (.mcap) with ground truth, or arrays t, robot, ids, beacons (.npz)."""
+
+
+@dataclass
+class InspectOptions:
+    """Tell what a recording holds: topics, rates, gaps, nodes heard, and what is missing."""
+
+    log: Positional[Path]
+    """MCAP recording, or a ROS 2 bag folder with one."""
+    config: Path | None = None
+    """Settings in TOML, for the topics and the robot's id."""
+
+
+def call(name: str, words: Sequence[str]) -> None:
+    """Runs one command with its own arguments.
+
+    Raises:
+      USER_ERRORS: see there. SystemExit: bad usage (status 2), or help was asked for (0); the text is printed.
+    """
+    options, run = _COMMANDS[name]
+    default = None
+    if options is RunOptions:
+        default = RunOptions(tyro.MISSING, tyro.MISSING, settings=_settings_file(words))
+    run(tyro.cli(options, args=list(words), default=default, prog=f"uwbslam {name}", description=options.__doc__))
+
+
+def _settings_file(words: Sequence[str]) -> Settings:
+    """The settings of the file given by --config: they are the defaults that the flags are read against."""
+    for k, word in enumerate(words):
+        if word == "--config" and k + 1 < len(words):
+            return config.load(words[k + 1])
+        if word.startswith("--config="):
+            return config.load(word.removeprefix("--config="))
+    return Settings()
+
+
+def run(options: RunOptions) -> None:
+    """The command `run`."""
+    settings = options.settings
+    if options.no_odom:
+        settings = dataclasses.replace(settings, odom=dataclasses.replace(settings.odom, use=False))
+    if options.lidar_only:
+        settings = dataclasses.replace(settings, filter=dataclasses.replace(settings.filter, lidar_only=True))
+    _run_and_write(options.log, config.check(settings), options.out, quiet=options.quiet, online=options.online)
+
+
+def demo(options: DemoOptions) -> None:
+    """The command `demo`."""
+    options.out.mkdir(parents=True, exist_ok=True)
+    made = _scenario("workshop", options.seed, options.duration)
+    log = options.out / "demo.mcap"
+    _record(made, log, options.quiet)
+    settings = config.from_dict(settings_overrides(made))
+    _run_and_write(log, settings, options.out, quiet=options.quiet, title="UWB and LiDAR SLAM demo")
+
+
+def simulate_scenario(options: SimulateOptions) -> None:
+    """The command `simulate`."""
+    made = _scenario(options.name, options.seed, options.duration)
+    _record(made, options.out, options.quiet)
+    print(f"recording: {options.out} ({made.duration:.1f} s)")
+    text = _differences(config.from_dict(settings_overrides(made)))
+    if text:
+        path = options.out.with_suffix(".toml")
+        path.write_text(text, encoding="utf-8")
+        print(f"settings: {path}")
+
+
+def evaluate_run(options: EvaluateOptions) -> None:
+    """The command `evaluate`."""
+    found = read_run(options.directory)
+    beacons = dict(zip(found.beacon_ids.tolist(), found.beacons, strict=True))
+    figures = evaluate(found.stamps, found.poses, beacons, _load_truth(options.truth))
+    print(_table(_accuracy(figures)))
+
+
+def inspect_log(options: InspectOptions) -> None:
+    """The command `inspect`."""
+    s = config.load(options.config) if options.config else Settings()
+    topics = {"scan_topic": s.lidar.topic, "uwb_topic": s.uwb.topic, "odom_topic": s.odom.topic}
+    print(format_summary(inspect(options.log, **topics, robot_id=s.robot.id, max_range=s.uwb.max_range)))
+
+
+_COMMANDS: dict[str, tuple[Any, Callable[[Any], None]]] = {
+    "demo": (DemoOptions, demo),
+    "run": (RunOptions, run),
+    "simulate": (SimulateOptions, simulate_scenario),
+    "evaluate": (EvaluateOptions, evaluate_run),
+    "inspect": (InspectOptions, inspect_log),
+}
+
+
+# What several commands share.
+
+
+def _run_and_write(
+    log: Path, settings: Settings, out: Path, *, quiet: bool, online: bool = False, title: str | None = None
+) -> None:
+    """Runs a recording, writes every file of the run and prints its figures."""
+    out.mkdir(parents=True, exist_ok=True)  # before the long work, not after it
+    with tqdm(desc="run", unit="msg", leave=False, disable=True if quiet else None) as bar:
+
+        def progress(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        result, truth = run_log(log, settings, online=online, progress=progress)
+    figures = None
+    if truth is not None:
+        beacons = {beacon.id: beacon.position for beacon in result.beacons}
+        figures = evaluate(result.stamps, result.poses, beacons, truth)
+    write_report(result, out / "report.html", figures, title or f"UWB and LiDAR SLAM: {log.name}")
+    result.summary |= figures or {}
+    write_result(result, out)
+    for warning in result.summary["warnings"]:
+        print(f"warning: {warning}", file=sys.stderr)
+    if result.summary["truncated"]:
+        print(f"warning: {result.summary['truncated']}", file=sys.stderr)
+    print(_table([*_accuracy(figures or {}), *_effort(result)]))
+    print(f"report: {out / 'report.html'}")
+
+
+def _accuracy(figures: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """Figures against the truth, named, with units."""
+    named = {
+        "robot_rmse_m": ("robot, RMS", "{:.3f} m"),
+        "robot_ate_m": ("robot, ATE (aligned alone)", "{:.3f} m"),
+        "robot_max_m": ("robot, largest", "{:.3f} m"),
+        "heading_deg_median": ("heading, median", "{:.2f} deg"),
+        "heading_deg_p95": ("heading, 95 %", "{:.2f} deg"),
+        "beacon_mean_m": ("beacons, mean", "{:.3f} m"),
+        "beacon_max_m": ("beacons, largest", "{:.3f} m"),
+        "covered": ("share of the time covered", "{:.3f}"),
+    }
+    for key, (name, form) in named.items():
+        if key in figures:
+            yield name, form.format(figures[key])
+    if figures.get("beacons_missing"):
+        yield "beacons not placed", ", ".join(map(str, figures["beacons_missing"]))
+
+
+def _effort(result: Result) -> Iterator[tuple[str, str]]:
+    """What was found, and what it took."""
+    summary = result.summary
+    decided = summary["decided_at"]
+    states = [beacon.status for beacon in result.beacons]
+    yield "frame decided at", f"{decided:.1f} s" if decided is not None else f"never ({summary['status']})"
+    counts = [f"{states.count(status)} {status}" for status in dict.fromkeys(states)]
+    yield "beacons placed", f"{len(states)} of {len(summary['ids'])} ({', '.join(counts)})" if states else "none"
+    yield "recording", f"{summary['duration_s']:.1f} s, {summary['steps']} steps"
+    yield "step, median and 95 %", f"{summary['step_ms_median']:.2f} ms, {summary['step_ms_p95']:.2f} ms"
+    yield "real-time factor", f"{summary['real_time_factor']:.1f} (compilation, {summary['compile_s']:.1f} s, left out)"
+
+
+def _table(rows: Iterable[tuple[str, str]]) -> str:
+    rows = list(rows)
+    width = max(len(name) for name, _ in rows)
+    return "\n".join(f"{name:<{width}}  {value}" for name, value in rows)
+
+
+def _scenario(name: str, seed: int, duration: float | None) -> Scenario:
+    if name not in SCENARIOS:
+        raise UsageError(f"no scenario {name}; there are {', '.join(SCENARIOS)}")
+    if seed < 0:
+        raise UsageError(f"seed {seed}: must not be negative")
+    if duration is not None and not 0.0 < duration < 1e6:
+        raise UsageError(f"duration {duration:g} s: must be greater than 0")
+    return scenario(name, seed, duration)
+
+
+def _record(made: Scenario, path: Path, quiet: bool) -> None:
+    """Writes the messages of a scenario."""
+    scans = int(made.duration * made.lidar.rate)
+    bar = tqdm(desc="simulate", unit="scan", total=scans, leave=False, disable=True if quiet else None)
+    with LogWriter(path) as writer, bar:
+        for message in simulate(made):
+            writer.write(message)
+            bar.update(isinstance(message, ScanMessage))
+
+
+def _differences(settings: Settings) -> str:
+    """TOML of what differs from the defaults, "" where nothing does."""
+    usual = dict(_sections(config.dump(Settings())))
+    blocks = []
+    for head, lines in _sections(config.dump(settings)):
+        if changed := [line for line in lines if line not in usual[head]]:
+            blocks.append("\n".join([head, *changed]) + "\n")
+    return "\n".join(blocks)
+
+
+def _sections(text: str) -> Iterator[tuple[str, list[str]]]:
+    for block in text.strip().split("\n\n"):
+        head, *lines = block.split("\n")
+        yield head, lines
+
+
+def _load_truth(path: Path) -> Truth:
+    """Ground truth of a recording or of an .npz file."""
+    try:
+        if path.suffix == ".npz":
+            return Truth.load(path)
+        messages: Iterator[Message] = iter(LogReader(path, scan_topic=None, uwb_topic=None, odom_topic=None))
+        return Truth.from_messages(m for m in messages if isinstance(m, TruthMessage))
+    except LogError:
+        raise
+    except (ValueError, zipfile.BadZipFile) as error:
+        raise UsageError(str(error) if str(path) in str(error) else f"{path}: {error}") from None
