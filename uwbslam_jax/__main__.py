@@ -40,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         hint = f", did you mean {near[0]}?" if near else f"; there are {', '.join(COMMANDS)}"
         return _fail(f"no command {words[0]}{hint}")
     try:
-        _keep_compiled()
+        keep_compiled()
         from uwbslam_jax import commands
 
         return _guarded(commands, words)
@@ -68,7 +68,7 @@ def _fail(text: str) -> int:
     return BAD_INPUT
 
 
-def _keep_compiled() -> None:
+def keep_compiled() -> None:
     """Compiled programs are kept in the user's cache folder: the second run starts in seconds."""
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "uwbslam_jax" / "jax"
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache))

@@ -1,0 +1,1 @@
+"""Measured figures: each module is run by `python -m` and writes its tables to results/."""
