@@ -7,8 +7,8 @@ import numpy as np
 from uwbslam_jax.config import Config
 from uwbslam_jax.measurements import Frame, Odometry, Ranges, Scan
 
-CORNERS = np.array([[-4.0, -3.0], [4.5, -3.0], [4.5, 1.0], [2.0, 1.0], [2.0, 3.5], [-4.0, 3.5]])
-"""An L-shaped room [m]: no rotation or reflection maps it to itself."""
+CORNERS = np.array([[-4.0, -3.0], [4.5, -3.0], [4.5, 1.0], [2.0, 1.0], [2.0, 3.5], [-4.0, 3.5]]) + 0.05
+"""An L-shaped room [m]: no rotation or reflection maps it to itself. Its walls run through middles of 0.1 m cells."""
 WALLS = np.stack([CORNERS, np.roll(CORNERS, -1, axis=0)], axis=1)
 
 

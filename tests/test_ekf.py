@@ -113,7 +113,7 @@ def test_ten_thousand_float32_updates_keep_the_covariance_healthy_and_near_that_
     Q = np.kron(np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]), np.eye(2)) * 0.1
 
     def jacobian(p, xp):
-        u = p - xp.asarray(anchors, p.dtype)
+        u = p[None] - xp.asarray(anchors, p.dtype)
         d = xp.sqrt((u**2).sum(1))
         return xp.concatenate([u / d[:, None], 0 * u], axis=1), d
 
@@ -124,7 +124,7 @@ def test_ten_thousand_float32_updates_keep_the_covariance_healthy_and_near_that_
         F32, Q32 = jnp.asarray(F, jnp.float32), jnp.asarray(Q, jnp.float32)
         belief = ekf.predict(belief, F32 @ belief.mean, F32, Q32)
         H, h = jacobian(belief.mean[:2], jnp)
-        truth = jnp.sqrt(jnp.sum((place(k, jnp) - jnp.asarray(anchors, jnp.float32)) ** 2, axis=1))
+        truth = jnp.sqrt(jnp.sum((place(k, jnp)[None] - jnp.asarray(anchors, jnp.float32)) ** 2, axis=1))
         belief = ekf.update_information(belief, H.T @ H / variance, H.T @ (truth - h) / variance)
         P = belief.cov
         spread = jnp.sqrt(jnp.diagonal(P))

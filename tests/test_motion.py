@@ -1,0 +1,197 @@
+"""The process model: known motions, its Jacobian and its noise."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from derivatives import assert_gradient, double
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.linalg import expm
+
+from uwbslam_jax import layout, motion
+from uwbslam_jax.config import Params, Settings, UwbSettings, make_params
+from uwbslam_jax.ekf import Gaussian
+from uwbslam_jax.layout import Nodes
+from uwbslam_jax.measurements import Odometry
+
+NODES = 3
+SIZE = layout.state_size(NODES)
+NONE = Odometry(jnp.zeros(3), jnp.array(False))
+RESTING = jnp.zeros(NODES, bool)
+CARRIED = jnp.array([False, True, False])
+
+
+@pytest.fixture
+def params() -> Params:
+    return make_params(Settings(uwb=UwbSettings(max_beacons=NODES - 1)))
+
+
+def state(velocity=(0.0, 0.0), heading=0.0, yaw_rate=0.0, map_error=(0.0, 0.0, 0.0), beacon_velocity=(0.0, 0.0)):
+    positions = jnp.array([[1.0, 2.0], [5.0, 0.0], [-3.0, 4.0]])
+    velocities = jnp.array([velocity, beacon_velocity, beacon_velocity])
+    nodes = Nodes(positions, velocities, jnp.array(heading), jnp.array(yaw_rate), jnp.array(map_error))
+    return layout.pack(nodes)
+
+
+def driven(dt: float, odometry: Odometry = NONE, moving=RESTING, **start) -> Nodes:
+    return layout.unpack(motion.transition(state(**start), jnp.array(dt), odometry, moving))
+
+
+def odometry(x: float, y: float, turn: float) -> Odometry:
+    return Odometry(jnp.array([x, y, turn]), jnp.array(True))
+
+
+def test_layout_packs_and_unpacks_the_same_entries():
+    vector = jnp.arange(SIZE, dtype=jnp.float32)
+    np.testing.assert_array_equal(layout.pack(layout.unpack(vector)), vector)
+    assert layout.node_count(SIZE) == NODES
+    s = layout.unpack(vector)
+    np.testing.assert_array_equal(vector[jnp.array(layout.pose_indices(NODES))], [*s.positions[0], s.heading])
+    np.testing.assert_array_equal(vector[jnp.array(layout.map_error_indices(NODES))], s.map_error)
+    want = layout.robot_pose(vector) + s.map_error
+    np.testing.assert_array_equal(layout.matched_pose_jacobian(NODES) @ vector, want)
+
+
+def test_constant_velocity_over_a_short_time():
+    s = driven(0.01, velocity=(0.8, -0.2), yaw_rate=0.0)
+    # coasting shortens the step by dt / (2 * 1.5 s) = 0.3 %
+    np.testing.assert_allclose(s.positions[0] - jnp.array([1.0, 2.0]), [0.008, -0.002], rtol=5e-3)
+    np.testing.assert_allclose(s.velocities[0], [0.8, -0.2], rtol=5e-3)
+
+
+def test_coordinated_turn_follows_the_circle():
+    v, w, dt = 1.0, 0.5, 0.1
+    s = driven(dt, velocity=(v, 0.0), yaw_rate=w)
+    arc = np.array([np.sin(w * dt), 1 - np.cos(w * dt)]) * v / w
+    # the chord's direction is exact, its length is coasting's (3 % of 0.1 m)
+    step = np.asarray(s.positions[0]) - [1.0, 2.0]
+    np.testing.assert_allclose(np.arctan2(step[1], step[0]), np.arctan2(arc[1], arc[0]), rtol=0.05)
+    np.testing.assert_allclose(step, arc, rtol=0.08)
+    # the velocity turns with the robot and keeps its direction against the heading
+    np.testing.assert_allclose(np.arctan2(s.velocities[0][1], s.velocities[0][0]), s.heading, atol=1e-6)
+
+
+def test_a_robot_that_is_not_seen_comes_to_rest_within_its_coasting_distance():
+    far, farther = driven(20.0, velocity=(1.0, 0.0)), driven(200.0, velocity=(1.0, 0.0))
+    np.testing.assert_allclose(far.positions[0], [2.5, 2.0], atol=1e-4)  # 1.5 s of coasting, e^-13 from its end
+    np.testing.assert_allclose(farther.positions[0], far.positions[0], atol=1e-4)
+
+
+def test_odometry_moves_the_robot_by_its_increment_in_the_robots_own_frame():
+    s = driven(0.1, odometry(0.1, 0.02, 0.05), heading=np.pi / 2, velocity=(9.0, 9.0), yaw_rate=9.0)
+    # at a heading of 90 degrees, forward is +y and left is -x
+    np.testing.assert_allclose(s.positions[0], [1.0 - 0.02, 2.0 + 0.1], atol=1e-6)
+    np.testing.assert_allclose(s.heading, np.pi / 2 + 0.05, rtol=1e-6)
+    np.testing.assert_allclose(s.velocities[0], [-0.2, 1.0], atol=1e-5)
+    np.testing.assert_allclose(s.yaw_rate, 0.5, rtol=1e-5)
+
+
+def test_only_carried_beacons_move():
+    s = driven(0.01, moving=CARRIED, beacon_velocity=(1.0, 0.5))
+    np.testing.assert_allclose(s.positions[1], [5.01, 0.005], rtol=5e-3)  # coasting, as above
+    np.testing.assert_array_equal(s.positions[2], [-3.0, 4.0])
+    np.testing.assert_array_equal(s.velocities[2], [0.0, 0.0])
+
+
+def test_map_error_is_a_rigid_motion_that_a_later_pose_sees_through_its_lever_arm():
+    """A map turned by a small angle about the start shows the robot off by angle x distance driven."""
+    start = dict(map_error=(0.0, 0.0, 0.01), heading=0.0)
+    s = driven(0.1, odometry(2.0, 0.0, 0.0), **start)
+    turned = 2.0 * np.array([np.cos(0.01) - 1, np.sin(0.01)])
+    np.testing.assert_allclose(s.map_error, [*turned, 0.01], atol=2e-4)  # second order: 2 m * 0.01^2 / 2
+
+
+def test_time_zero_is_no_motion_and_finite(params):
+    belief = Gaussian(state(velocity=(1.0, 0.0), yaw_rate=1.0), jnp.eye(SIZE))
+    after = motion.predict(belief, params, jnp.array(0.0), NONE, RESTING, jnp.array(0.0))
+    np.testing.assert_allclose(after.mean, belief.mean, atol=1e-6)
+    assert np.isfinite(after.cov).all()
+
+
+def test_white_acceleration_noise_is_that_of_the_exact_discretisation(params):
+    """Q of [position, velocity] under white acceleration by Van Loan's matrix exponential, per axis."""
+    dt = 0.1
+    q = float(params.sigma_w) ** 2
+    A, G = np.array([[0.0, 1.0], [0.0, 0.0]]), np.diag([0.0, q])
+    block = expm(dt * np.block([[-A, G], [np.zeros((2, 2)), A.T]]))
+    want = block[2:, 2:].T @ block[:2, 2:]
+    diagonal, coupling = motion.process_noise(params, jnp.array(dt), NONE, RESTING)
+    got = np.array([[diagonal[0], coupling[0]], [coupling[0], diagonal[2 * NODES]]])
+    np.testing.assert_allclose(got, want, rtol=1e-5)  # float32
+
+
+@pytest.mark.parametrize("measured", [NONE, odometry(0.2, 0.0, 0.3)], ids=["no odometry", "odometry"])
+@given(st.floats(0.0, 30.0), st.floats(0.0, 1.0))
+def test_predicted_covariance_is_symmetric_and_not_negative(measured, dt, novelty):
+    params = make_params(Settings(uwb=UwbSettings(max_beacons=NODES - 1)))
+    belief = Gaussian(state(velocity=(1.0, 0.3), yaw_rate=0.5), 1e-4 * jnp.eye(SIZE))
+    after = motion.predict(belief, params, jnp.float32(dt), measured, CARRIED, jnp.float32(novelty))
+    P = np.asarray(after.cov, float)
+    np.testing.assert_array_equal(P, P.T)
+    scale = np.sqrt(np.diag(P))
+    assert np.linalg.eigvalsh(P / np.outer(scale, scale)).min() > -1e-6  # float32
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("measured", [None, (0.3, -0.1, 0.2)], ids=["no odometry", "odometry"])
+def test_covariance_is_carried_by_the_jacobian_of_the_transition(params, measured):
+    """F P F^T + Q with F by central differences of the transition, novelty 0."""
+    params, dt = double(params), jnp.array(0.2)
+    odometry = Odometry(jnp.array(measured or (0.0, 0.0, 0.0)), jnp.array(measured is not None))
+    x = double(state(velocity=(0.8, 0.3), heading=0.4, yaw_rate=0.3, map_error=(0.01, 0.02, 0.003)))
+    rng = np.random.default_rng(0)
+    root = 0.1 * rng.normal(size=(SIZE, SIZE))
+    F = np.stack(
+        [
+            (motion.transition(x + h, dt, odometry, CARRIED) - motion.transition(x - h, dt, odometry, CARRIED)) / 2e-6
+            for h in 1e-6 * jnp.eye(SIZE)
+        ],
+        axis=1,
+    )
+    zero = Gaussian(x, jnp.zeros((SIZE, SIZE)))
+    Q = motion.predict(zero, params, dt, odometry, CARRIED, jnp.array(0.0)).cov
+    belief = Gaussian(x, jnp.asarray(root @ root.T))
+    after = motion.predict(belief, params, dt, odometry, CARRIED, jnp.array(0.0))
+    np.testing.assert_allclose(after.cov - Q, F @ (root @ root.T) @ F.T, atol=1e-8)  # of a central difference
+
+
+def test_map_error_forgets_with_novelty_and_falls_back_to_its_stationary_spread(params):
+    rows = np.array(layout.map_error_indices(NODES))
+    belief = Gaussian(state(map_error=(0.3, 0.2, 0.01)), jnp.zeros((SIZE, SIZE)))
+    after = motion.predict(belief, params, jnp.array(0.1), NONE, RESTING, jnp.array(1.0))
+    np.testing.assert_array_equal(after.mean[rows], np.zeros(3))
+    spread = [float(params.sigma_map)] * 2 + [float(params.sigma_map_yaw)]
+    np.testing.assert_allclose(np.sqrt(np.diag(after.cov)[rows]), spread, rtol=1e-4)  # + 1e-12 of its own
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("measured", [None, (0.3, -0.1, 0.2)], ids=["no odometry", "odometry"])
+def test_gradient_of_a_prediction_agrees_with_finite_differences(params, measured):
+    params = double(params)
+    rng = np.random.default_rng(0)
+    root = jnp.asarray(0.1 * rng.normal(size=(SIZE, SIZE)))
+    x = double(state(velocity=(0.8, 0.3), heading=0.4, yaw_rate=0.3, map_error=(0.01, 0.02, 0.003)))
+    weights = jnp.asarray(rng.normal(size=SIZE))
+
+    def value(at):
+        mean, sigma_w, sigma_map, dt, increment = at
+        changed = params._replace(sigma_w=sigma_w, sigma_map=sigma_map)
+        odometry = Odometry(increment, jnp.array(measured is not None))
+        after = motion.predict(Gaussian(mean, root @ root.T), changed, dt, odometry, CARRIED, jnp.array(0.3))
+        return weights @ after.mean + jnp.sum(after.cov * jnp.outer(weights, weights))
+
+    increment = jnp.array(measured or (0.0, 0.0, 0.0))
+    assert_gradient(value, (x, params.sigma_w, params.sigma_map, jnp.array(0.2), increment))
+
+
+@pytest.mark.usefixtures("x64")
+def test_gradient_at_rest_without_odometry_is_finite(params):
+    def value(mean):
+        belief = Gaussian(mean, jnp.eye(SIZE))
+        after = motion.predict(belief, double(params), jnp.array(0.1), NONE, RESTING, jnp.array(0.0))
+        return jnp.sum(after.mean) + jnp.sum(after.cov)
+
+    assert np.isfinite(jax.grad(value)(double(state()))).all()
