@@ -17,8 +17,8 @@ _RANGE_FLOOR_M = 0.02
 """However many ranges are averaged, their mean is not better than this."""
 DECIDED = 15.0
 """Difference of log-likelihood that decides between two explanations."""
-_SIGMA_ENOUGH_M = 0.15
-"""A beacon enters when its position is known this well in the start frame."""
+SIGMA_ENOUGH_M = 0.15
+"""A beacon enters when its position is known this well among the others."""
 
 
 @dataclass
@@ -57,10 +57,21 @@ class Placement:
     cov: np.ndarray
 
     def beacon_sigma(self) -> np.ndarray:
-        """(B,) largest standard deviation of each beacon's position [m]."""
+        """(B,) largest standard deviation of each beacon's position in the start frame [m]."""
+        return largest_sigma(self.cov[self.poses.size :, self.poses.size :])
+
+    def only(self, kept: list[int]) -> Placement:
+        """The same with some of the beacons, given by their index."""
         n = self.poses.size
-        blocks = [self.cov[n + 2 * b : n + 2 * b + 2, n + 2 * b : n + 2 * b + 2] for b in range(len(self.slots))]
-        return np.array([np.sqrt(np.linalg.eigvalsh(block)[-1]) for block in blocks])
+        columns = np.concatenate([np.arange(n), *[n + 2 * b + np.arange(2) for b in kept]]).astype(int)
+        cov = self.cov[np.ix_(columns, columns)]
+        return Placement(self.poses, [self.slots[b] for b in kept], self.beacons[kept], self.cost, cov)
+
+
+def largest_sigma(cov: np.ndarray) -> np.ndarray:
+    """(B,) largest standard deviation of each of B points with joint covariance (2 B, 2 B)."""
+    blocks = [cov[2 * b : 2 * b + 2, 2 * b : 2 * b + 2] for b in range(len(cov) // 2)]
+    return np.array([np.sqrt(max(np.linalg.eigvalsh(block)[-1], 0.0)) for block in blocks])
 
 
 @dataclass(frozen=True)
@@ -246,11 +257,10 @@ class Problem:
             J[rows, poses.size + 2 * j + axis] = -weight[:, axis]
         return J, r
 
-    def keep_sure(self, best: Placement) -> Placement:
-        """The placement without the beacons whose position is uncertain or has a second place as good."""
-        sigma = best.beacon_sigma()
-        antenna = self._antenna(best.poses)
-        sure = []
+    def keep_unique(self, best: Placement) -> Placement:
+        """The placement without the beacons that have a second place which explains the ranges as well."""
+        antenna, sigma = self._antenna(best.poses), best.beacon_sigma()
+        unique = []
         for b in range(len(self.slots)):
             mine = self.to == b
             spots = np.stack(multilaterate(antenna[mine], self.distance[mine], self.sigma[mine]))
@@ -258,14 +268,9 @@ class Problem:
             moved = best.beacons.copy()
             moved[b] = away
             _, r = self._linearise(best.poses, moved)
-            unique = np.linalg.norm(away - best.beacons[b]) < 4 * sigma[b] or 0.5 * r @ r - best.cost > DECIDED
-            sure.append(bool(unique and sigma[b] < _SIGMA_ENOUGH_M))
-        kept = [b for b, ok in enumerate(sure) if ok]
-        n = best.poses.size
-        columns = np.concatenate([np.arange(n), *[n + 2 * b + np.arange(2) for b in kept]]).astype(int)
-        return Placement(
-            best.poses, [best.slots[b] for b in kept], best.beacons[kept], best.cost, best.cov[np.ix_(columns, columns)]
-        )
+            near = np.linalg.norm(away - best.beacons[b]) < max(4 * sigma[b], 0.3)
+            unique.append(near or 0.5 * r @ r - best.cost > DECIDED)
+        return best.only([b for b, ok in enumerate(unique) if ok])
 
 
 def multilaterate(anchors: np.ndarray, distance: np.ndarray, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -341,7 +346,7 @@ def locate(anchors: np.ndarray, distance: np.ndarray, sigma: np.ndarray) -> tupl
     """
     best, second = multilaterate(anchors, distance, sigma)
     cost, cov = _fit(best, anchors, distance, sigma)
-    if np.sqrt(np.linalg.eigvalsh(cov)[-1]) > _SIGMA_ENOUGH_M:
+    if np.sqrt(np.linalg.eigvalsh(cov)[-1]) > SIGMA_ENOUGH_M:
         return None
     other, _ = _fit(second, anchors, distance, sigma)
     if np.linalg.norm(second - best) > 0.3 and other - cost < DECIDED:

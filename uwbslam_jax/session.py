@@ -146,14 +146,14 @@ class Session:
         if now - self._solved_at < _SOLVE_EVERY_S * 1e9:
             return
         self._solved_at = now
-        outcome = startup.solve(self._buffer)
+        ids = {slot: node for node, slot in self._slots.items()}
+        outcome = startup.solve(self._buffer, ids)
         if outcome.status != self.status:
             self.history.event(now, outcome.status)
         self.status, self.hypotheses = outcome.status, outcome.hypotheses
         if outcome.placement is None:
             return
-        ids = {slot: node for node, slot in self._slots.items()}
-        origin, along = sorted(outcome.placement.slots, key=lambda slot: ids[slot])[:2]
+        origin, along = startup.choose_frame(outcome.placement, ids)
         adopted = startup.adopt(self.config, self.params, self.state, self._buffer, outcome.placement, (origin, along))
         self.state, self.decided_at = adopted.state, now
         self.tiles.clear()

@@ -19,7 +19,7 @@ from uwbslam_jax import layout, slam
 from uwbslam_jax.config import Config, Params
 from uwbslam_jax.ekf import Gaussian
 from uwbslam_jax.measurements import Ranges, Scan, StampedFrame
-from uwbslam_jax.placement import DECIDED, Keyframe, Placement, Problem, rotation
+from uwbslam_jax.placement import DECIDED, SIGMA_ENOUGH_M, Keyframe, Placement, Problem, largest_sigma, rotation
 from uwbslam_jax.slam import Estimate, State
 from uwbslam_jax.tiles import TILE
 
@@ -28,6 +28,8 @@ _KEYFRAME_MOVED = (0.25, 0.2)
 _KEYFRAMES = 64
 """A longer start is thinned: every other keyframe goes."""
 _MOVED_ENOUGH_M = 1.0
+_HEADING_ENOUGH = 0.026
+"""Start-up ends when the robot's heading among the beacons is known this well [rad]."""
 
 
 class Buffer:
@@ -114,8 +116,8 @@ class Outcome:
     placement: Placement | None
 
 
-def solve(buffer: Buffer) -> Outcome:
-    """Place the beacons if what is buffered determines them."""
+def solve(buffer: Buffer, ids: dict[int, int]) -> Outcome:
+    """Place the beacons if what is buffered determines them. ids: slot -> node id."""
     if buffer.extent < _MOVED_ENOUGH_M:
         return Outcome("waiting for motion", 0, 0.0, None)
     problem = Problem.build(buffer.keyframes, buffer.pairs, buffer.sigma_n)
@@ -131,10 +133,42 @@ def solve(buffer: Buffer) -> Outcome:
     margin = min(margin, _margin(best, mirrored))
     if margin < DECIDED:
         return Outcome("reflection undecided", 2, margin, None)
-    sure = problem.keep_sure(best)
-    if len(sure.slots) < 2:
+    sure = _keep_certain(problem.keep_unique(best), ids)
+    if sure is None:
         return Outcome("placing beacons", 1, margin, None)
     return Outcome("decided", 1, margin, sure)
+
+
+def _keep_certain(placement: Placement, ids: dict[int, int]) -> Placement | None:
+    """The beacons whose place in the published frame is certain, None where the robot's own is not.
+
+    The start frame is no measure: all beacons turn together with the heading that the track started with.
+    """
+    if len(placement.slots) < 2:
+        return None
+    frame_slots = choose_frame(placement, ids)
+    onward = np.zeros(3)
+    x, cov = _last_and_beacons(placement)
+    J = _numeric_jacobian(partial(_published, slots=placement.slots, frame_slots=frame_slots, onward=onward), x)
+    cov = J @ cov @ J.T
+    if np.sqrt(cov[2, 2]) > _HEADING_ENOUGH or largest_sigma(cov[:2, :2])[0] > SIGMA_ENOUGH_M:
+        return None
+    certain = largest_sigma(cov[3:, 3:]) < SIGMA_ENOUGH_M
+    return placement.only([b for b, ok in enumerate(certain) if ok]) if sum(certain) >= 2 else None
+
+
+def choose_frame(placement: Placement, ids: dict[int, int]) -> tuple[int, int]:
+    """Slots of the beacons at the origin and on +x: the lowest id, and the one farthest from it, which fixes the
+    direction best. ids: slot -> node id."""
+    origin = min(placement.slots, key=lambda slot: ids[slot])
+    away = np.linalg.norm(placement.beacons - placement.beacons[placement.slots.index(origin)], axis=1)
+    return origin, placement.slots[int(np.argmax(away))]
+
+
+def _last_and_beacons(placement: Placement) -> tuple[np.ndarray, np.ndarray]:
+    """Last keyframe's pose and the beacons as one vector, with their covariance."""
+    last = placement.poses.size - 3
+    return np.concatenate([placement.poses[-1], placement.beacons.ravel()]), placement.cov[last:, last:]
 
 
 def _margin(best: Placement, other: Placement) -> float:
@@ -181,12 +215,10 @@ def adopt(
     before = np.array([key.pose for key in buffer.keyframes])
     pose = np.asarray(layout.robot_pose(state.belief.mean), float)
     onward = between(before[-1], pose)
-    x = np.concatenate([placement.poses[-1], placement.beacons.ravel()])
-    n, last = placement.poses.size, placement.poses.size - 3
-    at = np.concatenate([np.arange(last, n), np.arange(n, len(placement.cov))])
+    x, cov = _last_and_beacons(placement)
     y = partial(_published, slots=placement.slots, frame_slots=frame_slots, onward=onward)
     J = _numeric_jacobian(y, x)
-    cov = J @ placement.cov[np.ix_(at, at)] @ J.T
+    cov = J @ cov @ J.T
     motion = _frame_motion(placement.beacons, placement.slots, frame_slots)
     after = compose(motion, placement.poses)
     belief = _belief(state.belief, config.nodes, y(x), cov, placement.slots, pose)
