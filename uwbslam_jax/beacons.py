@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 import jax.numpy as jnp
 import numpy as np
 
-
 from uwbslam_jax.config import Params, Settings
 from uwbslam_jax.ekf import Gaussian
 from uwbslam_jax.measurements import StampedFrame
@@ -153,5 +152,3 @@ def _without(state: State, slot: int) -> State:
     """The state without a beacon; its row of the covariance becomes that of an empty slot."""
     state = _with(state, slot, np.zeros(2), np.eye(2))
     return state._replace(active=state.active.at[slot].set(False))
-
-

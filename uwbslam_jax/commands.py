@@ -118,7 +118,8 @@ def call(name: str, words: Sequence[str]) -> None:
     options, run = _COMMANDS[name]
     default = None
     if options is RunOptions:
-        default = RunOptions(tyro.MISSING, tyro.MISSING, settings=_settings_file(words))
+        default = RunOptions(Path(), Path(), settings=_settings_file(words))
+        default.log = default.out = tyro.MISSING  # these two have to be given all the same
     run(tyro.cli(options, args=list(words), default=default, prog=f"uwbslam {name}", description=options.__doc__))
 
 

@@ -29,7 +29,7 @@ class Params(NamedTuple):
     """The tunable leaves, all differentiable. K = 1 + max_beacons slots, slot 0 is the robot.
 
     Attributes:
-      gamma, sigma_n, sigma_w, sigma_w_yaw, sigma_w_beacon, sigma_l, beam_share, sigma_map, sigma_map_yaw: see
+      gamma, sigma_n, sigma_w, sigma_w_paper, sigma_w_yaw, sigma_w_beacon, sigma_l, beam_share, sigma_map, sigma_map_yaw: see
         FilterSettings and UwbSettings.
       odom_sigma_xy, odom_sigma_yaw, odom_sigma_floor: see OdomSettings.
       antenna: x, y of the UWB antenna on the robot [m].
@@ -41,6 +41,7 @@ class Params(NamedTuple):
     gamma: Float[Array, ""]
     sigma_n: Float[Array, ""]
     sigma_w: Float[Array, ""]
+    sigma_w_paper: Float[Array, ""]
     sigma_w_yaw: Float[Array, ""]
     sigma_w_beacon: Float[Array, ""]
     sigma_l: Float[Array, ""]
@@ -173,7 +174,9 @@ class FilterSettings:
     gamma: float = 0.65
     """Weight of a squared range residual against a squared LiDAR residual in the joint objective [1/m^2]; paper only."""
     sigma_w: float = 1.0
-    """Acceleration noise of the robot [m/s^1.5]; in the paper preset the paper's sigma_w of every node [m/s]."""
+    """Acceleration noise of the robot [m/s^1.5]."""
+    sigma_w_paper: float = 0.1
+    """The paper's sigma_w, the same for every node [m/s]; preset paper only."""
     sigma_w_yaw: float = 2.0
     """Angular acceleration noise of the robot [rad/s^1.5]."""
     sigma_w_beacon: float = 1e-4
@@ -234,7 +237,7 @@ def make_params(settings: Settings, slots: dict[int, int] | None = None) -> Para
         bias[slot] = settings.uwb.bias.get(str(node), 0.0)
         if slot > 0:
             height[slot] = settings.uwb.height.get(str(node), settings.robot.antenna[2])
-    leaves: dict[str, Any] = {n: getattr(f, n) for n in ("gamma", "sigma_w", "sigma_w_yaw", "sigma_w_beacon", "sigma_l")}
+    leaves: dict[str, Any] = {n: getattr(f, n) for n in ("gamma", "sigma_w", "sigma_w_paper", "sigma_w_yaw", "sigma_w_beacon", "sigma_l")}
     leaves |= {n: getattr(f, n) for n in ("beam_share", "sigma_map", "sigma_map_yaw")}
     leaves |= {f"odom_{n}": getattr(odom, n) for n in ("sigma_xy", "sigma_yaw", "sigma_floor")}
     leaves |= {"sigma_n": settings.uwb.sigma_n, "antenna": settings.robot.antenna[:2], "lidar": settings.robot.lidar}

@@ -33,17 +33,13 @@ def symmetric_root(cov: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return std[:, None] * jnp.linalg.cholesky(correlation + eps * jnp.eye(cov.shape[0], dtype=cov.dtype))
 
 
-def predict(
-    belief: Gaussian, mean: Float[Array, "n"], F: Float[Array, "n n"], Q: Float[Array, "n n"]
-) -> Gaussian:
+def predict(belief: Gaussian, mean: Float[Array, "n"], F: Float[Array, "n n"], Q: Float[Array, "n n"]) -> Gaussian:
     """Belief after a motion: the predicted mean, F P F^T + Q (paper, "EKF update")."""
     cov = F @ belief.cov @ F.T + Q
     return Gaussian(mean, (cov + cov.T) / 2)
 
 
-def update_information(
-    belief: Gaussian, information: Float[Array, "n n"], gradient: Float[Array, "n"]
-) -> Gaussian:
+def update_information(belief: Gaussian, information: Float[Array, "n n"], gradient: Float[Array, "n"]) -> Gaussian:
     """Belief after measurements whose information form is given.
 
     With Jacobian H, noise R and innovation nu: information = H^T R^-1 H and gradient = H^T R^-1 nu. The result is

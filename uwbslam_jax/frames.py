@@ -107,13 +107,19 @@ class FrameAssembler:
             return []
         self._newest_range[pair] = message.stamp
         self._ranges.append(message)
-        if message.stamp - (self._last or self._ranges[0].stamp) > _SCANLESS_S * 2e9 and not self._expects_scan(message.stamp):
+        if message.stamp - (self._last or self._ranges[0].stamp) > _SCANLESS_S * 2e9 and not self._expects_scan(
+            message.stamp
+        ):
             return self._without_scan(before=message.stamp)
         return []
 
     def _expects_scan(self, stamp: int) -> bool:
         # odometry that lags behind the ranges would leave a frame without its increment: wait for it
-        return bool(self._odometry) and stamp - self._odometry[-1].stamp > _ODOMETRY_HOLD_S * 1e9 and stamp - (self._last or stamp) < 15e9
+        return (
+            bool(self._odometry)
+            and stamp - self._odometry[-1].stamp > _ODOMETRY_HOLD_S * 1e9
+            and stamp - (self._last or stamp) < 15e9
+        )
 
     def _add_odometry(self, message: OdometryMessage) -> None:
         if not self._settings.odom.use:
@@ -139,7 +145,9 @@ class FrameAssembler:
         frames: list[StampedFrame] = []
         while self._ranges:
             first = self._last if self._last is not None else self._ranges[0].stamp
-            ready = [m for m in self._ranges if m.stamp - first <= _SCANLESS_S * 1e9 or m is self._ranges[0]][: self._max_ranges]
+            ready = [m for m in self._ranges if m.stamp - first <= _SCANLESS_S * 1e9 or m is self._ranges[0]][
+                : self._max_ranges
+            ]
             rest = self._ranges[len(ready) :]
             overdue = before is None or (before - first > _SCANLESS_S * 1.5e9) or len(self._ranges) > self._max_ranges
             if not overdue or (before is not None and (ready[-1].stamp >= before or not rest)):

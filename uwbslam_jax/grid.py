@@ -34,7 +34,9 @@ class Grid(NamedTuple):
 def empty(cells: int, levels: int, resolution: float) -> Grid:
     """A window without any observation, centred at (0, 0)."""
     half = cells * resolution / 2
-    return Grid(tuple(jnp.zeros((cells >> k, cells >> k), jnp.float32) for k in range(levels)), jnp.full(2, -half, jnp.float32))
+    return Grid(
+        tuple(jnp.zeros((cells >> k, cells >> k), jnp.float32) for k in range(levels)), jnp.full(2, -half, jnp.float32)
+    )
 
 
 _WINDOW = lax.GatherDimensionNumbers(offset_dims=(1, 2), collapsed_slice_dims=(), start_index_map=(0, 1))
@@ -112,7 +114,9 @@ def integrate(grid: Grid, pose: Float[Array, "3"], sweep: Sweep, resolution: flo
     x = pose[0] + c * sweep.points[:, 0] - s * sweep.points[:, 1]
     y = pose[1] + s * sweep.points[:, 0] + c * sweep.points[:, 1]
     ends = jnp.stack([x, y], axis=-1)
-    sensor = pose[:2] + jnp.stack([c * sweep.sensor[0] - s * sweep.sensor[1], s * sweep.sensor[0] + c * sweep.sensor[1]])
+    sensor = pose[:2] + jnp.stack(
+        [c * sweep.sensor[0] - s * sweep.sensor[1], s * sweep.sensor[0] + c * sweep.sensor[1]]
+    )
     yaw = pose[2] + sweep.sensor[2]
     levels = []
     for k, level in enumerate(grid.levels):
@@ -132,7 +136,8 @@ def _integrate_level(level, origin, size, ends, sensor, yaw, sweep):
     shift = start - (middle - half)
     bearing = _shifted(bearing, shift)
     distance = _shifted(distance, shift)
-    free = _passed(bearing, distance, yaw, size, sweep)
+    # a sensor outside the window is beyond the shifted tables: it frees nothing
+    free = _passed(bearing, distance, yaw, size, sweep) & jnp.all((middle >= 0) & (middle <= cells))
     block = jnp.where(free, block + FREE, block)
     freed = lax.dynamic_update_slice(level, block, (start[1], start[0]))
     cell = jnp.floor((ends - origin[None]) / size).astype(jnp.int32)

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+
 class Nodes(NamedTuple):
     """The state vector taken apart; see the module's first lines for shapes and units."""
 

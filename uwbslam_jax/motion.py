@@ -29,7 +29,9 @@ def transition(
     coasted = rotation(turn / 2) @ s.velocities[0] * coast
     driven = rotation(s.heading) @ odometry.increment[:2]
     step = jnp.where(odometry.valid, driven, coasted)
-    velocity = jnp.where(odometry.valid, driven / safe_dt, rotation(turn) @ s.velocities[0] * jnp.exp(-dt / (4 * _COAST_S)))
+    velocity = jnp.where(
+        odometry.valid, driven / safe_dt, rotation(turn) @ s.velocities[0] * jnp.exp(-dt / (4 * _COAST_S))
+    )
     yaw_step = jnp.where(odometry.valid, odometry.increment[2], turn)
     yaw_rate = jnp.where(odometry.valid, odometry.increment[2] / safe_dt, s.yaw_rate * jnp.exp(-dt / (4 * _COAST_S)))
     velocities = jnp.where(moving[:, None], s.velocities, 0.0).at[0].set(velocity)
@@ -64,8 +66,16 @@ def process_noise(
     odo_xy = (params.odom_sigma_floor[0] + params.odom_sigma_xy * length) ** 2
     odo_yaw = (params.odom_sigma_floor[1] + params.odom_sigma_yaw * jnp.abs(odometry.increment[2])) ** 2
     w, w_yaw = params.sigma_w**2, params.sigma_w_yaw**2
-    robot = jnp.where(odometry.valid, jnp.stack([odo_xy, odo_xy / safe_dt, odo_xy / safe_dt**2]), w * jnp.stack([t**3 / 3, t**2 / 2, t]))
-    yaw = jnp.where(odometry.valid, jnp.stack([odo_yaw, odo_yaw / safe_dt, odo_yaw / safe_dt**2]), w_yaw * jnp.stack([t**3 / 3, t**2 / 2, t]))
+    robot = jnp.where(
+        odometry.valid,
+        jnp.stack([odo_xy, odo_xy / safe_dt, odo_xy / safe_dt**2]),
+        w * jnp.stack([t**3 / 3, t**2 / 2, t]),
+    )
+    yaw = jnp.where(
+        odometry.valid,
+        jnp.stack([odo_yaw, odo_yaw / safe_dt, odo_yaw / safe_dt**2]),
+        w_yaw * jnp.stack([t**3 / 3, t**2 / 2, t]),
+    )
     carried = jnp.stack([t**3 / 3, t**2 / 2, t])
     resting = jnp.stack([params.sigma_w_beacon**2 * dt, 0.0 * dt, 1e-10 + 0.0 * dt])
     nodes = jnp.where(moving[:, None], carried, resting).at[0].set(robot)  # (K, 3): position, coupling, velocity

@@ -104,7 +104,9 @@ class Problem:
                 heard[slot] = heard.get(slot, 0) + 1
         slots = sorted(slot for slot, count in heard.items() if count >= 3)
         index = {slot: b for b, slot in enumerate(slots)}
-        rows = [(k, index[s], *_average(seen)) for k, key in enumerate(keys) for s, seen in key.seen.items() if s in index]
+        rows = [
+            (k, index[s], *_average(seen)) for k, key in enumerate(keys) for s, seen in key.seen.items() if s in index
+        ]
         between = [(index[i], index[j], d) for (i, j), d in pairs.items() if i in index and j in index]
         track = np.array([key.pose for key in keys])
         steps, roots = _steps(keys)

@@ -7,12 +7,12 @@ joined, drops those that fell silent, and moves the map's window. The steps in b
 
 from __future__ import annotations
 
+import dataclasses
 from collections import Counter
 from collections.abc import Sequence
 from functools import partial
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
@@ -67,7 +67,8 @@ class Session:
 
     def __init__(self, settings: Settings):
         self.settings = settings
-        self.config = make_config(settings)
+        # until the beacons are placed there is nothing for the paper's steps to stand on
+        self.config = dataclasses.replace(make_config(settings), preset="robust")
         self.params = make_params(settings)
         self.state = slam.init(self.config)
         self.tiles = Tiles(settings.map.resolution)
@@ -156,6 +157,7 @@ class Session:
         origin, along = startup.choose_frame(outcome.placement, ids)
         adopted = startup.adopt(self.config, self.params, self.state, self._buffer, outcome.placement, (origin, along))
         self.state, self.decided_at = adopted.state, now
+        self.config = make_config(self.settings)
         self.tiles.clear()
         self.history.republish(adopted)
         self.history.event(now, f"frame decided by beacons {ids[origin]} and {ids[along]}")

@@ -1,6 +1,7 @@
 """One step: a frame of measurements in, the corrected state and its estimate out. Reads like the list of steps.
 
     predict -> ranges -> match -> fuse -> draw                                    (preset "robust", DESIGN 1.1-1.9)
+    predict -> ranges -> frame, heading -> joint match -> correct -> draw         (preset "paper", module `paper`)
 
 Pure functions of fixed shape; a beacon that joins or drops changes a mask. Start-up and beacon life are not here.
 """
@@ -15,7 +16,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from uwbslam_jax import grid as occupancy
-from uwbslam_jax import layout, matching, motion, ranging
+from uwbslam_jax import layout, matching, motion, paper, ranging
 from uwbslam_jax.config import Config, Params
 from uwbslam_jax.ekf import Gaussian, update_information
 from uwbslam_jax.geometry import rotation, transform_points, wrap_angle
@@ -50,6 +51,7 @@ class State(NamedTuple):
       belief: over the state vector.
       active: (K,) slots in use, the robot's always.
       moving: (K,) nodes taken to be carried about.
+      frame_slots: (2,) the beacons that make the published frame, for preset "paper".
       grid: the map's window.
       drawn_pose: (3,) where the last scan was drawn.
       scans_drawn: how many were.
@@ -59,6 +61,7 @@ class State(NamedTuple):
     belief: Gaussian
     active: Bool[Array, "K"]
     moving: Bool[Array, "K"]
+    frame_slots: Int[Array, "2"]
     grid: Grid
     drawn_pose: Float[Array, "3"]
     scans_drawn: Int[Array, ""]
@@ -114,6 +117,7 @@ def init(config: Config) -> State:
         belief=Gaussian(jnp.zeros(n, jnp.float32), jnp.diag(variance)),
         active=jnp.zeros(config.nodes, bool).at[0].set(True),
         moving=jnp.zeros(config.nodes, bool),
+        frame_slots=jnp.array([1, 2], jnp.int32),
         grid=occupancy.empty(config.cells, config.levels, config.resolution),
         drawn_pose=jnp.zeros(3, jnp.float32),
         scans_drawn=jnp.zeros((), jnp.int32),
@@ -122,27 +126,72 @@ def init(config: Config) -> State:
 
 
 def step(config: Config, params: Params, state: State, frame: Frame) -> tuple[State, Estimate]:
-    """One frame through the estimator (preset "robust").
+    """One frame through the estimator.
 
     Differentiable in params, state and frame except through its decisions (search, drawing, cells), which are held.
     """
-    belief = motion.predict(state.belief, params, frame.dt, frame.odometry, state.moving, state.novelty)
-    belief, used = _use_ranges(config, params, state, belief, frame)
+    belief = _predict(config, params, state, frame)
+    usable = _usable(config, state, frame)
+    belief, used = ranging.update(belief, frame.ranges, usable, params, robust=config.preset == "robust")
+    if config.preset == "paper":
+        belief = paper.heading_from_velocity(paper.pin_frame(belief, state.frame_slots))
     s = layout.unpack(belief.mean)
     sweep = undo_motion(frame.scan, params.lidar, rotation(-s.heading) @ s.velocities[0], s.yaw_rate)
+    align = _joint_match if config.preset == "paper" else _match_and_fuse
+    belief, matched = align(config, params, state, belief, frame, sweep, usable)
+    state, drawn = _draw(config, state._replace(belief=belief), matched, sweep)
+    return state, _report(state, matched, used, drawn)
+
+
+def _predict(config, params, state, frame) -> Gaussian:
+    if config.preset == "paper":
+        return paper.predict(state.belief, params, frame.dt)
+    return motion.predict(state.belief, params, frame.dt, frame.odometry, state.moving, state.novelty)
+
+
+def _usable(config, state, frame) -> Bool[Array, "M"]:
+    r = frame.ranges
+    heard = r.valid & state.active[r.i] & state.active[r.j] & (not config.lidar_only)
+    return heard & ranging.line_of_sight(r, config.nlos_gap_db)
+
+
+class _Matched(NamedTuple):
+    """A match and what was made of it: the information it was given, and whether it may be drawn."""
+
+    match: Match
+    information: Float[Array, "3 3"]
+    poor: Bool[Array, ""]
+    searched: Bool[Array, ""]
+    trusted: Bool[Array, ""]
+
+
+def _match_and_fuse(config, params, state, belief, frame, sweep, usable) -> tuple[Gaussian, _Matched]:
+    """Preset "robust": align the scan fully, search where that fails, fuse what it is worth (DESIGN 1.8, 1.9)."""
+    del usable  # the ranges are in the belief already: every measurement counts once
     match, searched = _match(config, params, state, belief, sweep, frame.has_scan)
     surprise, information = _trust(match, belief, params)
     poor = ((match.known > _KNOWN_ENOUGH) & (match.score < _LOST_SCORE)) | (surprise > _SURPRISE)
     trusted = frame.has_scan & ~poor
     information = jnp.where(trusted, information, 0.0)
     belief = _fuse(belief, match.pose, information)
-    state, drawn = _draw(config, state._replace(belief=belief), match, sweep, trusted)
-    return state, _report(state, match, information, used, poor=poor & frame.has_scan, searched=searched, drawn=drawn)
+    return belief, _Matched(match, information, poor & frame.has_scan, searched, trusted)
 
 
-def undo_motion(
-    scan: Scan, lidar: Float[Array, "3"], velocity: Float[Array, "2"], yaw_rate: Float[Array, ""]
-) -> Sweep:
+def _joint_match(config, params, state, belief, frame, sweep, usable) -> tuple[Gaussian, _Matched]:
+    """Preset "paper": offset of all nodes and the heading by the joint objective, then the correction."""
+    offset = jnp.zeros(2 * config.nodes + 1, belief.mean.dtype)
+    if config.scan_matching:
+        free = paper.free_coordinates(state.active, state.frame_slots)
+        offset = paper.joint_match(state.grid, sweep, belief, frame.ranges, usable, free, params, config.resolution)
+        offset = jnp.where(frame.has_scan, offset, 0.0)
+    corrected = paper.correct(belief, offset)
+    match = matching.assess(state.grid, sweep, layout.robot_pose(corrected.mean), config.resolution)
+    no = jnp.zeros((), bool)
+    matched = _Matched(match, jnp.zeros((3, 3)), no, no, frame.has_scan)
+    return corrected if config.correction else belief, matched
+
+
+def undo_motion(scan: Scan, lidar: Float[Array, "3"], velocity: Float[Array, "2"], yaw_rate: Float[Array, ""]) -> Sweep:
     """The scan in the robot's frame at its stamp: each beam placed at its own time.
 
     Args:
@@ -160,13 +209,6 @@ def undo_motion(
     points = jnp.stack([ct * x - st * y + velocity[0] * age, st * x + ct * y + velocity[1] * age], axis=-1)
     step = scan.angle_increment + yaw_rate * scan.time_increment
     return Sweep(points, scan.valid, lidar, scan.angle_min, step, reach)
-
-
-def _use_ranges(config, params, state, belief, frame):
-    r = frame.ranges
-    usable = r.valid & state.active[r.i] & state.active[r.j] & (not config.lidar_only)
-    usable = usable & ranging.line_of_sight(r, config.nlos_gap_db)
-    return ranging.update(belief, r, usable, params, robust=True)
 
 
 def _match(config, params, state, belief, sweep, has_scan) -> tuple[Match, Bool[Array, ""]]:
@@ -211,20 +253,20 @@ def _fuse(belief: Gaussian, pose: Float[Array, "3"], information: Float[Array, "
     return update_information(belief, C.T @ information @ C, C.T @ (information @ innovation))
 
 
-def _draw(config, state, match, sweep, trusted):
-    s = layout.unpack(state.belief.mean)
-    moved = jnp.hypot(*(match.pose[:2] - state.drawn_pose[:2])) > _DRAW_MOVED[0]
-    turned = jnp.abs(match.pose[2] - state.drawn_pose[2]) > _DRAW_MOVED[1]
-    wanted = trusted & (moved | turned | (state.scans_drawn < _DRAW_FIRST))
-    novelty = _novelty(config, state.grid, sweep, match.pose)
+def _draw(config, state, matched: _Matched, sweep) -> tuple[State, Bool[Array, ""]]:
+    """The map with the scan drawn, when it may be and the robot has moved or turned since the last one."""
+    pose = matched.match.pose
+    moved = jnp.hypot(*(pose[:2] - state.drawn_pose[:2])) > _DRAW_MOVED[0]
+    turned = jnp.abs(wrap_angle(pose[2] - state.drawn_pose[2])) > _DRAW_MOVED[1]
+    wanted = matched.trusted & (moved | turned | (state.scans_drawn < _DRAW_FIRST))
+    novelty = _novelty(config, state.grid, sweep, pose)
     limit = jnp.array([_DRAW_PULL[0], _DRAW_PULL[0], _DRAW_PULL[1]])
-    pose = match.pose - jnp.minimum(1.0, novelty / _NEW_GROUND) * jnp.clip(s.map_error, -limit, limit)
-    levels = lax.cond(
-        wanted, lambda g: occupancy.integrate(g, pose, sweep, config.resolution), lambda g: g, state.grid
-    )
+    pull = jnp.clip(layout.unpack(state.belief.mean).map_error, -limit, limit)
+    at = pose - jnp.minimum(1.0, novelty / _NEW_GROUND) * pull
+    grid = lax.cond(wanted, lambda g: occupancy.integrate(g, at, sweep, config.resolution), lambda g: g, state.grid)
     state = state._replace(
-        grid=levels,
-        drawn_pose=jnp.where(wanted, match.pose, state.drawn_pose),
+        grid=grid,
+        drawn_pose=jnp.where(wanted, pose, state.drawn_pose),
         scans_drawn=state.scans_drawn + wanted,
         novelty=jnp.where(wanted & (state.scans_drawn > 0), novelty, 0.0),
     )
@@ -240,7 +282,7 @@ def _novelty(config, grid, sweep, pose):
     return jnp.sum(new) / jnp.maximum(jnp.sum(sweep.valid), 1)
 
 
-def _report(state, match, information, used, *, poor, searched, drawn) -> Estimate:
+def _report(state, matched: _Matched, used, drawn) -> Estimate:
     s = layout.unpack(state.belief.mean)
     k = s.positions.shape[0]
     at = jnp.array(layout.pose_indices(k))
@@ -256,12 +298,12 @@ def _report(state, match, information, used, *, poor, searched, drawn) -> Estima
         beacon_covs=blocks[node, :, node, :],
         active=state.active,
         moving=state.moving,
-        matched_pose=match.pose,
-        information=information,
-        score=match.score,
-        known=match.known,
-        poor=poor,
-        searched=searched,
+        matched_pose=matched.match.pose,
+        information=matched.information,
+        score=matched.match.score,
+        known=matched.match.known,
+        poor=matched.poor,
+        searched=matched.searched,
         drawn=drawn,
         innovation=used.innovation,
         normalised=used.normalised,

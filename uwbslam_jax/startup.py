@@ -224,7 +224,13 @@ def adopt(
     belief = _belief(state.belief, config.nodes, y(x), cov, placement.slots, pose)
     active = jnp.zeros(config.nodes, bool).at[jnp.array([0, *placement.slots])].set(True)
     grid = _redraw(config, params, buffer.keyframes, after, y(x)[:2])
-    adopted = state._replace(belief=belief, active=active, grid=grid, drawn_pose=jnp.asarray(y(x)[:3], jnp.float32))
+    adopted = state._replace(
+        belief=belief,
+        active=active,
+        frame_slots=jnp.array(frame_slots, jnp.int32),
+        grid=grid,
+        drawn_pose=jnp.asarray(y(x)[:3], jnp.float32),
+    )
     return Adopted(adopted, np.array([key.frame.stamp for key in buffer.keyframes]), before, after)
 
 
@@ -287,7 +293,13 @@ def _redraw(config: Config, params: Params, keys: list[Keyframe], poses: np.ndar
         if bool(key.frame.frame.has_scan):
             drift = jnp.asarray(rotation(-key.pose[2]) @ key.velocity, jnp.float32)
             grid = _draw_one(
-                config, params, grid, jnp.asarray(pose, jnp.float32), key.frame.frame.scan, drift, np.float32(key.yaw_rate)
+                config,
+                params,
+                grid,
+                jnp.asarray(pose, jnp.float32),
+                key.frame.frame.scan,
+                drift,
+                np.float32(key.yaw_rate),
             )
     return grid
 
