@@ -23,6 +23,8 @@ NONE = Odometry(jnp.zeros(3), jnp.array(False))
 RESTING = jnp.zeros(NODES, bool)
 CARRIED = jnp.array([False, True, False])
 
+predict, transition = jax.jit(motion.predict), jax.jit(motion.transition)
+
 
 @pytest.fixture
 def params() -> Params:
@@ -37,7 +39,7 @@ def state(velocity=(0.0, 0.0), heading=0.0, yaw_rate=0.0, map_error=(0.0, 0.0, 0
 
 
 def driven(dt: float, odometry: Odometry = NONE, moving=RESTING, **start) -> Nodes:
-    return layout.unpack(motion.transition(state(**start), jnp.array(dt), odometry, moving))
+    return layout.unpack(transition(state(**start), jnp.array(dt), odometry, moving))
 
 
 def odometry(x: float, y: float, turn: float) -> Odometry:
@@ -106,7 +108,7 @@ def test_map_error_is_a_rigid_motion_that_a_later_pose_sees_through_its_lever_ar
 
 def test_time_zero_is_no_motion_and_finite(params):
     belief = Gaussian(state(velocity=(1.0, 0.0), yaw_rate=1.0), jnp.eye(SIZE))
-    after = motion.predict(belief, params, jnp.array(0.0), NONE, RESTING, jnp.array(0.0))
+    after = predict(belief, params, jnp.array(0.0), NONE, RESTING, jnp.array(0.0))
     np.testing.assert_allclose(after.mean, belief.mean, atol=1e-6)
     assert np.isfinite(after.cov).all()
 
@@ -128,7 +130,7 @@ def test_white_acceleration_noise_is_that_of_the_exact_discretisation(params):
 def test_predicted_covariance_is_symmetric_and_not_negative(measured, dt, novelty):
     params = make_params(Settings(uwb=UwbSettings(max_beacons=NODES - 1)))
     belief = Gaussian(state(velocity=(1.0, 0.3), yaw_rate=0.5), 1e-4 * jnp.eye(SIZE))
-    after = motion.predict(belief, params, jnp.float32(dt), measured, CARRIED, jnp.float32(novelty))
+    after = predict(belief, params, jnp.float32(dt), measured, CARRIED, jnp.float32(novelty))
     P = np.asarray(after.cov, float)
     np.testing.assert_array_equal(P, P.T)
     scale = np.sqrt(np.diag(P))
@@ -146,22 +148,22 @@ def test_covariance_is_carried_by_the_jacobian_of_the_transition(params, measure
     root = 0.1 * rng.normal(size=(SIZE, SIZE))
     F = np.stack(
         [
-            (motion.transition(x + h, dt, odometry, CARRIED) - motion.transition(x - h, dt, odometry, CARRIED)) / 2e-6
+            (transition(x + h, dt, odometry, CARRIED) - transition(x - h, dt, odometry, CARRIED)) / 2e-6
             for h in 1e-6 * jnp.eye(SIZE)
         ],
         axis=1,
     )
     zero = Gaussian(x, jnp.zeros((SIZE, SIZE)))
-    Q = motion.predict(zero, params, dt, odometry, CARRIED, jnp.array(0.0)).cov
+    Q = predict(zero, params, dt, odometry, CARRIED, jnp.array(0.0)).cov
     belief = Gaussian(x, jnp.asarray(root @ root.T))
-    after = motion.predict(belief, params, dt, odometry, CARRIED, jnp.array(0.0))
+    after = predict(belief, params, dt, odometry, CARRIED, jnp.array(0.0))
     np.testing.assert_allclose(after.cov - Q, F @ (root @ root.T) @ F.T, atol=1e-8)  # of a central difference
 
 
 def test_map_error_forgets_with_novelty_and_falls_back_to_its_stationary_spread(params):
     rows = np.array(layout.map_error_indices(NODES))
     belief = Gaussian(state(map_error=(0.3, 0.2, 0.01)), jnp.zeros((SIZE, SIZE)))
-    after = motion.predict(belief, params, jnp.array(0.1), NONE, RESTING, jnp.array(1.0))
+    after = predict(belief, params, jnp.array(0.1), NONE, RESTING, jnp.array(1.0))
     np.testing.assert_array_equal(after.mean[rows], np.zeros(3))
     spread = [float(params.sigma_map)] * 2 + [float(params.sigma_map_yaw)]
     np.testing.assert_allclose(np.sqrt(np.diag(after.cov)[rows]), spread, rtol=1e-4)  # + 1e-12 of its own
@@ -180,7 +182,7 @@ def test_gradient_of_a_prediction_agrees_with_finite_differences(params, measure
         mean, sigma_w, sigma_map, dt, increment = at
         changed = params._replace(sigma_w=sigma_w, sigma_map=sigma_map)
         odometry = Odometry(increment, jnp.array(measured is not None))
-        after = motion.predict(Gaussian(mean, root @ root.T), changed, dt, odometry, CARRIED, jnp.array(0.3))
+        after = predict(Gaussian(mean, root @ root.T), changed, dt, odometry, CARRIED, jnp.array(0.3))
         return weights @ after.mean + jnp.sum(after.cov * jnp.outer(weights, weights))
 
     increment = jnp.array(measured or (0.0, 0.0, 0.0))
@@ -191,7 +193,7 @@ def test_gradient_of_a_prediction_agrees_with_finite_differences(params, measure
 def test_gradient_at_rest_without_odometry_is_finite(params):
     def value(mean):
         belief = Gaussian(mean, jnp.eye(SIZE))
-        after = motion.predict(belief, double(params), jnp.array(0.1), NONE, RESTING, jnp.array(0.0))
+        after = predict(belief, double(params), jnp.array(0.1), NONE, RESTING, jnp.array(0.0))
         return jnp.sum(after.mean) + jnp.sum(after.cov)
 
     assert np.isfinite(jax.grad(value)(double(state()))).all()

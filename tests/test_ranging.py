@@ -21,6 +21,9 @@ from uwbslam_jax.measurements import Odometry, Ranges
 NODES = 4
 SIZE = layout.state_size(NODES)
 PAIRS = room.all_pairs(NODES)
+predicted_ranges = jax.jit(ranging.predicted_ranges)
+update = jax.jit(ranging.update, static_argnames="robust")
+
 POSITIONS = np.array([[0.5, -0.3], [4.0, 0.0], [-3.0, 3.0], [1.0, -5.0]])
 VELOCITIES = np.array([[0.8, 0.4], [0.0, 0.0], [0.1, -0.2], [0.0, 0.0]])
 HEADING, YAW_RATE = 0.7, 0.5
@@ -67,7 +70,7 @@ def measured(distances, ages=0.0, gap=np.nan, size=8) -> Ranges:
 
 def test_predicted_range_has_lever_arm_height_bias_and_age(params):
     ages = np.array([-0.09, -0.05, 0.0, -0.02, -0.08, -0.1])
-    predicted = ranging.predicted_ranges(vector(), measured(np.zeros(6), ages), params)[:6]
+    predicted = predicted_ranges(vector(), measured(np.zeros(6), ages), params)[:6]
     want = [by_hand(i, j, age, params) for (i, j), age in zip(PAIRS, ages, strict=True)]
     np.testing.assert_allclose(predicted, want, rtol=1e-6)  # float32
 
@@ -77,7 +80,7 @@ def test_slant_range_at_one_metre_with_0_8_m_of_height_is_0_28_m_longer():
     flat = flat_params(height=jnp.zeros(NODES))
     raised = flat_params(height=jnp.array([0.0, 0.8, 0.0, 0.0]))
     ranges = measured(np.zeros(6))
-    rise = ranging.predicted_ranges(vector(positions), ranges, raised) - ranging.predicted_ranges(
+    rise = predicted_ranges(vector(positions), ranges, raised) - predicted_ranges(
         vector(positions), ranges, flat
     )
     assert 0.28 < float(rise[0]) < 0.29  # sqrt(1.64) - 1
@@ -87,21 +90,21 @@ def test_slant_range_at_one_metre_with_0_8_m_of_height_is_0_28_m_longer():
 def test_bias_of_a_pair_is_the_sum_of_both_nodes():
     biased = flat_params(bias=jnp.array([0.1, 0.02, -0.3, 0.0]))
     ranges = measured(np.zeros(6))
-    plain = ranging.predicted_ranges(vector(), ranges, flat_params())
-    extra = ranging.predicted_ranges(vector(), ranges, biased) - plain
+    plain = predicted_ranges(vector(), ranges, flat_params())
+    extra = predicted_ranges(vector(), ranges, biased) - plain
     np.testing.assert_allclose(extra[:6], [0.12, -0.2, 0.1, -0.28, 0.02, -0.3], atol=1e-6)
 
 
 def test_nodes_at_one_place_give_a_finite_range_and_gradient():
     same = np.tile([[1.0, 2.0]], (NODES, 1))
     ranges = measured(np.zeros(6))
-    value, pull = jax.vjp(lambda x: ranging.predicted_ranges(x, ranges, flat_params()), vector(same))
+    value, pull = jax.vjp(lambda x: predicted_ranges(x, ranges, flat_params()), vector(same))
     np.testing.assert_array_equal(value, 0.0)
     np.testing.assert_array_equal(pull(jnp.ones(8))[0], 0.0)
-    H = jax.jacfwd(ranging.predicted_ranges)(vector(same), ranges, flat_params())
+    H = jax.jacfwd(predicted_ranges)(vector(same), ranges, flat_params())
     np.testing.assert_array_equal(H, 0.0)
     belief = Gaussian(vector(same), jnp.eye(SIZE))
-    after, used = ranging.update(belief, measured(np.ones(6)), jnp.arange(8) < 6, flat_params(), robust=True)
+    after, used = update(belief, measured(np.ones(6)), jnp.arange(8) < 6, flat_params(), robust=True)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((after, used)))
 
 
@@ -117,8 +120,8 @@ def test_update_by_many_ranges_is_the_textbook_update(params):
     truth = np.array([by_hand(i, j, 0.0, params) for i, j in PAIRS])
     z = truth + np.array([0.1, -0.05, 0.02, 0.07, -0.2, 0.03])
     ranges = measured(z)
-    after, used = ranging.update(belief, ranges, ranges.valid, params, robust=False)
-    H = np.asarray(jax.jacfwd(ranging.predicted_ranges)(belief.mean, ranges, params))[:6]
+    after, used = update(belief, ranges, ranges.valid, params, robust=False)
+    H = np.asarray(jax.jacfwd(predicted_ranges)(belief.mean, ranges, params))[:6]
     P, R = np.asarray(belief.cov), float(params.sigma_n) ** 2 * np.eye(6)
     S = H @ P @ H.T + R
     K = P @ H.T @ np.linalg.inv(S)
@@ -136,7 +139,7 @@ def test_update_by_many_ranges_is_the_textbook_update(params):
 def test_ranges_that_are_not_usable_change_nothing():
     belief = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), random_belief())
     wild = measured(np.full(6, 100.0))
-    after, used = ranging.update(belief, wild, jnp.zeros(8, bool), flat_params(), robust=True)
+    after, used = update(belief, wild, jnp.zeros(8, bool), flat_params(), robust=True)
     np.testing.assert_array_equal(after.mean, belief.mean)
     np.testing.assert_array_equal(used.weight, 0.0)
     np.testing.assert_array_equal(used.innovation, 0.0)
@@ -170,10 +173,10 @@ def test_robust_weight_is_a_quarter_at_three_sigma_and_bounds_the_pull():
 @pytest.mark.parametrize("sign", [1.0, -1.0], ids=["too long", "too short"])
 def test_an_outlier_of_either_sign_hardly_moves_the_state(sign):
     belief = Gaussian(vector(), 0.01 * jnp.eye(SIZE))
-    good = ranging.predicted_ranges(belief.mean, measured(np.zeros(6)), flat_params())[:6]
+    good = predicted_ranges(belief.mean, measured(np.zeros(6)), flat_params())[:6]
     bad = good.at[0].add(sign * 3.0)
     moved = [
-        ranging.update(belief, measured(bad), jnp.arange(8) < 6, flat_params(), robust=robust)[0].mean - belief.mean
+        update(belief, measured(bad), jnp.arange(8) < 6, flat_params(), robust=robust)[0].mean - belief.mean
         for robust in (True, False)
     ]
     assert np.abs(moved[0]).max() < 0.02 < 0.5 < np.abs(moved[1]).max()
@@ -195,7 +198,7 @@ def test_gradient_of_one_filter_step_agrees_with_finite_differences(params, robu
         changed = params._replace(**tunable)
         start = Gaussian(mean, root @ root.T)
         predicted = motion.predict(start, changed, jnp.array(0.1), none, jnp.zeros(NODES, bool), jnp.array(0.0))
-        after, used = ranging.update(
+        after, used = update(
             predicted, ranges._replace(range=distances), ranges.valid, changed, robust=robust
         )
         return weights @ after.mean + weights @ after.cov @ weights + 0.1 * used.log_likelihood

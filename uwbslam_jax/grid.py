@@ -70,7 +70,7 @@ def interpolate(
 
 
 def lookup(grid: Grid, points: Float[Array, "n 2"], resolution: float, level: int = 0) -> Float[Array, "n"]:
-    """Occupancy probability Gamma at points of the world, 0.5 outside the window. Differentiable in points and cells."""
+    """Occupancy probability Gamma at points, 0.5 outside the window. Differentiable in points and cells."""
     size = resolution * 2**level
     corners, at, inside = corner_log_odds(grid.levels[level], grid.origin, size, points)
     value, _ = interpolate(jax.nn.sigmoid(corners), at, size)
