@@ -45,12 +45,16 @@ _COLUMNS = {
     "heading_deg_median": ("heading median [deg]", 3),
     "decided_s": ("decided at [s]", 1),
     "real_time_factor": ("real-time factor", 1),
+    "load": ("machine load", 1),
 }
 
 
 @dataclass(frozen=True)
 class Row:
-    """One seed's figures; NaN where there is nothing to compare, decided_s where the frame never was decided."""
+    """One seed's figures; NaN where there is nothing to compare, decided_s where the frame never was decided.
+
+    load is the machine's (1 min average) when the seed was done: above 1 and other work has slowed the run down.
+    """
 
     seed: int
     robot_rmse_m: float
@@ -59,6 +63,7 @@ class Row:
     heading_deg_median: float
     decided_s: float
     real_time_factor: float
+    load: float
     beacons_missing: list[int] = field(default_factory=list)
 
     def passes(self, bar: Bar) -> bool:
@@ -86,6 +91,7 @@ def measure(name: str, seed: int, duration: float | None) -> Row:
         **{key: figures[key] for key in keys},
         decided_s=math.nan if decided is None else decided,
         real_time_factor=result.summary["real_time_factor"],
+        load=os.getloadavg()[0],
     )
 
 

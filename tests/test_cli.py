@@ -1,0 +1,318 @@
+"""The command line as a user calls it, and the run behind it: files, figures, one-line errors, same bits both ways."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from uwbslam_jax import commands, config
+from uwbslam_jax.__main__ import COMMANDS, main
+from uwbslam_jax.config import Settings
+from uwbslam_jax.mcap_log import LogReader, LogWriter
+from uwbslam_jax.measurements import Message, RangeMessage, ScanMessage, TruthMessage
+from uwbslam_jax.metrics import Truth
+from uwbslam_jax.outputs import read_run
+from uwbslam_jax.result import Result
+from uwbslam_jax.run import Facts, fit_beams, run_log, to_result
+from uwbslam_jax.session import CONTROL_EVERY, Session
+from uwbslam_jax.simulate import scenario, settings_overrides, simulate
+
+BEAMS = 181
+FRAMES = 135  # decided after 8 s; not a whole number of groups
+SMALL = replace(Settings(), map=replace(Settings().map, size_m=25.6))
+FILES = {"trajectory.tum", "beacons.csv", "map.pgm", "map.yaml", "result.mcap", "summary.json", "report.html"}
+
+Run = tuple[Result, Truth | None]
+
+
+def write(path: Path, messages: Sequence[Message]) -> Path:
+    with LogWriter(path) as writer:
+        for message in messages:
+            writer.write(message)
+    return path
+
+
+@pytest.fixture(scope="session")
+def messages() -> list[Message]:
+    """A hall as a small scanner sees it, long enough to be decided, with ground truth."""
+    made = scenario("hall", 0, FRAMES / 10)
+    return list(simulate(replace(made, lidar=replace(made.lidar, beams=BEAMS))))
+
+
+@pytest.fixture(scope="session")
+def log(tmp_path_factory: pytest.TempPathFactory, messages: list[Message]) -> Path:
+    return write(tmp_path_factory.mktemp("log") / "hall.mcap", messages)
+
+
+@pytest.fixture(scope="session")
+def batch(log: Path) -> Run:
+    return run_log(log, SMALL)
+
+
+@pytest.fixture(scope="session")
+def folder(tmp_path_factory: pytest.TempPathFactory, log: Path) -> Path:
+    """What `uwbslam run` writes, with a settings file of which one key is overridden by a flag."""
+    made = tmp_path_factory.mktemp("run")
+    (made / "my.toml").write_text("[uwb]\nsigma_n = 0.3\nmax_range = 90.0\n[map]\nsize_m = 25.6\n")
+    words = ["run", str(log), "-o", str(made / "out"), "--config", str(made / "my.toml"), "--uwb.sigma-n", "0.1"]
+    assert main([*words, "--quiet"]) == 0
+    return made / "out"
+
+
+class TestHelp:
+    def test_loads_no_jax(self) -> None:
+        code = "import sys; from uwbslam_jax.__main__ import main; main(['--help']); assert 'jax' not in sys.modules"
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30, check=False)
+        assert done.returncode == 0, done.stderr
+        assert all(name in done.stdout for name in COMMANDS)
+
+    @pytest.mark.parametrize("name", COMMANDS)
+    def test_every_command_tells_its_options(self, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+        with pytest.raises(SystemExit) as end:
+            main([name, "--help"])
+        assert end.value.code == 0
+        assert f"uwbslam {name}" in capsys.readouterr().out
+
+    def test_every_key_of_the_settings_is_a_flag(self, capsys: pytest.CaptureFixture[str]) -> None:
+        with pytest.raises(SystemExit):
+            main(["run", "--help"])
+        told = capsys.readouterr().out
+        for section, keys in ((s, vars(getattr(Settings(), s))) for s in vars(Settings())):
+            assert all(f"--{section}.{key.replace('_', '-')}" in told for key in keys)
+
+
+def test_demo(tmp_path: Path) -> None:
+    """The slow one: a process of its own, at full size."""
+    words = [sys.executable, "-m", "uwbslam_jax", "demo", "--duration", "20", "-o", str(tmp_path / "out"), "--quiet"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    assert "robot, RMS" in done.stdout
+    assert "report.html" in done.stdout
+    assert {path.name for path in (tmp_path / "out").iterdir()} == FILES | {"demo.mcap"}
+    found = read_run(tmp_path / "out")
+    assert len(found.stamps) == 200
+    assert found.summary["decided_at"] < 20
+    assert len(found.beacons) == 5
+    assert found.summary["robot_rmse_m"] < 0.05
+    assert found.summary["beacon_mean_m"] < 0.05
+
+
+class TestRun:
+    def test_files(self, folder: Path) -> None:
+        assert {path.name for path in folder.iterdir()} == FILES
+        summary = json.loads((folder / "summary.json").read_text())
+        assert summary["steps"] == FRAMES
+        assert summary["ids"] == [3, 5, 7, 9, 12]
+        assert summary["duration_s"] == pytest.approx((FRAMES - 1) / 10)
+        numbers = ("wall_s", "compile_s", "step_ms_median", "step_ms_p95", "real_time_factor", "peak_rss_mb")
+        assert all(summary[key] >= 0 for key in numbers)
+        told = ("dropped", "decided_at", "hypotheses", "status", "warnings", "version", "truncated", "odometry_used")
+        assert set(told) <= summary.keys()
+        assert summary["robot_rmse_m"] < 0.05
+
+    def test_flags_go_before_the_file(self, folder: Path) -> None:
+        settings = json.loads((folder / "summary.json").read_text())["config"]
+        assert settings["uwb"]["sigma_n"] == 0.1
+        assert settings["uwb"]["max_range"] == 90.0
+        assert settings["map"]["size_m"] == 25.6
+
+    def test_evaluate(self, folder: Path, log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        capsys.readouterr()
+        assert main(["evaluate", str(folder), str(log)]) == 0
+        told = dict(line.rsplit("  ", 1) for line in capsys.readouterr().out.splitlines())
+        figures = {name.strip(): value for name, value in told.items()}
+        summary = json.loads((folder / "summary.json").read_text())
+        # the files hold micrometres, the figures millimetres
+        assert figures["robot, RMS"] == f"{summary['robot_rmse_m']:.3f} m"
+        assert figures["beacons, mean"] == f"{summary['beacon_mean_m']:.3f} m"
+        assert figures["heading, median"] == f"{summary['heading_deg_median']:.2f} deg"
+
+    def test_online_and_batch_give_the_same_bits(self, log: Path, batch: Run) -> None:
+        online, (grouped, _) = run_log(log, SMALL, online=True)[0], batch
+        assert FRAMES % CONTROL_EVERY, "the last frames are no whole group: both ways of stepping take part"
+        assert grouped.summary["decided_at"] is not None
+        for name in ("stamps", "poses", "pose_covs", "range_residuals", "scan_points"):
+            assert np.array_equal(getattr(online, name), getattr(grouped, name)), name
+        assert np.array_equal(online.map.log_odds, grouped.map.log_odds)
+        assert [(b.id, *b.position, *b.cov.ravel()) for b in online.beacons] == [
+            (b.id, *b.position, *b.cov.ravel()) for b in grouped.beacons
+        ]
+        assert online.events == grouped.events
+
+    def test_a_result_speaks_of_ids_and_seconds(self, batch: Run, messages: list[Message]) -> None:
+        result, truth = batch
+        ids = {3, 5, 7, 9, 12}
+        assert truth is not None
+        assert set(truth.beacons) == ids
+        assert {b.id for b in result.beacons} == set(result.beacon_tracks) == ids
+        assert set(result.range_residuals[:, 1:3].ravel()) <= ids | {0}
+        assert 0 < result.range_residuals[:, 0].min() < result.range_residuals[:, 0].max() < FRAMES / 10
+        stamps = [m.stamp for m in messages if isinstance(m, ScanMessage)]
+        assert result.stamps.tolist() == stamps
+        assert all(len(series) == FRAMES for series in result.diagnostics.values())
+
+    def test_the_last_scan_lies_on_the_walls(self, batch: Run) -> None:
+        result, _ = batch
+        cells = np.floor((result.scan_points - result.map.origin) / result.map.resolution).astype(int)
+        size = np.array(result.map.log_odds.shape)[::-1]
+        cells = cells[((cells > 0) & (cells < size - 1)).all(axis=1)]  # the small window does not hold every wall
+        assert len(cells) > 0.7 * len(result.scan_points)
+        around = [result.map.log_odds[cells[:, 1] + dy, cells[:, 0] + dx] for dx in (-1, 0, 1) for dy in (-1, 0, 1)]
+        assert np.mean(np.max(around, axis=0) > 0) > 0.9
+
+    def test_the_estimator_never_sees_the_truth(self, tmp_path: Path, batch: Run, messages: list[Message]) -> None:
+        blind = write(tmp_path / "blind.mcap", [m for m in messages if not isinstance(m, TruthMessage)])
+        result, truth = run_log(blind, SMALL)
+        assert truth is None
+        assert np.array_equal(result.poses, batch[0].poses)
+
+    def test_a_cut_recording_is_used_up_to_there(
+        self, tmp_path: Path, log: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        whole = log.read_bytes()
+        (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) // 2])
+        words = ["run", str(tmp_path / "cut.mcap"), "-o", str(tmp_path / "out"), "--map.size-m", "25.6", "--quiet"]
+        assert main(words) == 0
+        assert "recording breaks after" in capsys.readouterr().err
+        summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+        assert "recording breaks after" in summary["truncated"]
+        assert 10 < summary["steps"] < FRAMES
+
+    def test_without_ranges_it_is_lidar_only(self, tmp_path: Path, messages: list[Message]) -> None:
+        scans = [m for m in messages if not isinstance(m, RangeMessage)]
+        path = write(tmp_path / "scans.mcap", scans[: len(scans) // 4])
+        # frame by frame: one program to compile instead of two
+        words = ["run", str(path), "-o", str(tmp_path / "out"), "--map.size-m", "25.6", "--online", "--quiet"]
+        assert main(words) == 0
+        found = read_run(tmp_path / "out")
+        assert found.summary["warnings"] == ["no UWB topic: LiDAR only"]
+        assert found.summary["config"]["filter"]["lidar_only"] is True
+        assert found.summary["decided_at"] is None
+        assert found.summary["robot_ate_m"] < 0.05
+        assert not len(found.beacons)
+
+    def test_a_beacon_that_left_keeps_its_last_place(self) -> None:
+        session = Session(replace(SMALL, lidar=replace(SMALL.lidar, max_beams=BEAMS)))
+        session.slots[77] = 1
+        session.history.beacons[1] = (np.array([1.0, 2.0]), np.eye(2) * 0.01)
+        (beacon,) = to_result(session, Facts()).beacons
+        assert (beacon.id, beacon.status, beacon.position.tolist()) == (77, "dropped", [1.0, 2.0])
+
+    @pytest.mark.parametrize(
+        ("sizes", "most", "slots"), [([180] * 12, 1081, 180), ([2000], 1081, 1081), ([400, 420], 1081, 525), ([], 9, 9)]
+    )
+    def test_slots_for_beams(self, sizes: list[int], most: int, slots: int) -> None:
+        settings = replace(Settings(), lidar=replace(Settings().lidar, max_beams=most))
+        scans = [ScanMessage(k, 0.0, 0.01, 0.0, 0.1, 30.0, np.ones(n, np.float32)) for k, n in enumerate(sizes)]
+        assert fit_beams(settings, scans).lidar.max_beams == slots
+
+
+def test_inspect(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["inspect", str(log)]) == 0
+    told = capsys.readouterr().out
+    assert f"beams a scan: {BEAMS}" in told
+    assert "pairs heard: 15 of 15" in told
+    assert "ground truth: yes" in told
+
+
+class TestSimulate:
+    def test_settings_that_fit_go_beside(self, tmp_path: Path) -> None:
+        path = tmp_path / "made.mcap"
+        assert main(["simulate", "lever_arms", "--seed", "3", "--duration", "1", "-o", str(path), "--quiet"]) == 0
+        made = scenario("lever_arms", 3, 1.0)
+        assert config.load(path.with_suffix(".toml")) == config.from_dict(settings_overrides(made))
+        assert sum(isinstance(m, ScanMessage) for m in LogReader(path)) == 10
+
+    def test_defaults_need_none(self, tmp_path: Path) -> None:
+        path = tmp_path / "made.mcap"
+        assert main(["simulate", "hall", "--duration", "0.3", "-o", str(path), "--quiet"]) == 0
+        assert [p.name for p in tmp_path.iterdir()] == ["made.mcap"]
+
+
+def ranges_only(folder: Path) -> str:
+    return str(write(folder / "ranges.mcap", [RangeMessage(10**18, 0, 1, 2.5)]))
+
+
+def no_return(folder: Path) -> str:
+    empty = ScanMessage(10**18, 0.0, 0.01, 0.0, 0.1, 30.0, np.zeros(0, np.float32))
+    return str(write(folder / "empty.mcap", [empty]))
+
+
+def text_file(name: str, text: str) -> Callable[[Path], str]:
+    def make(folder: Path) -> str:
+        (folder / name).write_text(text)
+        return str(folder / name)
+
+    return make
+
+
+WRONG: dict[str, tuple[list[Any], str]] = {
+    "missing": (["run", "none.mcap", "-o", "out"], "none.mcap: no such file"),
+    "not an mcap": (["run", text_file("a.mcap", "hello"), "-o", "out"], "not an MCAP file"),
+    "no scans": (["run", ranges_only, "-o", "out"], "no scan topic"),
+    "no usable scan": (["run", no_return, "-o", "out"], "no usable scan"),
+    "unknown key": (
+        ["run", "x.mcap", "-o", "out", "--config", text_file("a.toml", "[uwb]\nsigma = 1\n")],
+        "unknown key uwb.sigma, did you mean uwb.sigma_n?",
+    ),
+    "no settings file": (["run", "x.mcap", "-o", "out", "--config=none.toml"], "none.toml: No such file"),
+    "value out of range": (["run", "x.mcap", "-o", "out", "--uwb.sigma-n", "-1"], "uwb.sigma_n = -1.0: must be"),
+    "folder is a file": (["run", "x.mcap", "-o", text_file("taken", "")], "taken: File exists"),
+    "scenario": (["simulate", "hal", "-o", "x.mcap"], "no scenario hal; there are workshop, hall"),
+    "seed": (["demo", "--seed", "-1", "-o", "out"], "seed -1"),
+    "duration": (["demo", "--duration", "0", "-o", "out"], "duration 0 s"),
+    "command": (["ran", "x.mcap"], "no command ran, did you mean run?"),
+    "no run": (["evaluate", "none", "none.mcap"], "trajectory.tum: No such file"),
+    "inspect": (["inspect", text_file("a.mcap", "")], "the file is empty"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_what_a_user_can_mend_is_one_line(
+    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    words, says = WRONG[case]
+    assert main([word if isinstance(word, str) else word(tmp_path) for word in words]) == 2
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err.startswith("uwbslam: ")
+    assert told.err.count("\n") == 1
+    assert says in told.err
+
+
+@pytest.mark.parametrize(("name", "content"), [("truth.npz", "no zip"), ("truth.mcap", None)])
+def test_a_truth_that_is_none_is_one_line(
+    folder: Path, tmp_path: Path, name: str, content: str | None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / name
+    write(path, [RangeMessage(10**18, 0, 1, 2.5)]) if content is None else path.write_text(content)
+    capsys.readouterr()
+    assert main(["evaluate", str(folder), str(path)]) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert name in told
+
+
+def test_a_defect_of_ours_is_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(commands, "call", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        main(["demo"])
+
+
+def test_interrupted(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(commands, "call", interrupt)
+    assert main(["demo"]) == 130
+    assert capsys.readouterr().err == "uwbslam: interrupted\n"
