@@ -29,8 +29,8 @@ class Params(NamedTuple):
     """The tunable leaves, all differentiable. K = 1 + max_beacons slots, slot 0 is the robot.
 
     Attributes:
-      gamma, sigma_n, sigma_w, sigma_w_paper, sigma_w_yaw, sigma_w_beacon, sigma_l, beam_share, sigma_map, sigma_map_yaw: see
-        FilterSettings and UwbSettings.
+      gamma, sigma_n, sigma_w, sigma_w_paper, sigma_w_yaw, sigma_w_beacon, sigma_l, beam_share, sigma_map,
+        sigma_map_yaw: see FilterSettings and UwbSettings.
       odom_sigma_xy, odom_sigma_yaw, odom_sigma_floor: see OdomSettings.
       antenna: x, y of the UWB antenna on the robot [m].
       lidar: pose of the LiDAR on the robot [m, m, rad].
@@ -172,7 +172,7 @@ class FilterSettings:
     lidar_only: bool = False
     """Ignore all ranges: HectorSLAM's objective."""
     gamma: float = 0.65
-    """Weight of a squared range residual against a squared LiDAR residual in the joint objective [1/m^2]; paper only."""
+    """Weight of a range's square against a beam's in the joint objective [1/m^2]; preset paper only."""
     sigma_w: float = 1.0
     """Acceleration noise of the robot [m/s^1.5]."""
     sigma_w_paper: float = 0.1
@@ -237,11 +237,13 @@ def make_params(settings: Settings, slots: dict[int, int] | None = None) -> Para
         bias[slot] = settings.uwb.bias.get(str(node), 0.0)
         if slot > 0:
             height[slot] = settings.uwb.height.get(str(node), settings.robot.antenna[2])
-    leaves: dict[str, Any] = {n: getattr(f, n) for n in ("gamma", "sigma_w", "sigma_w_paper", "sigma_w_yaw", "sigma_w_beacon", "sigma_l")}
-    leaves |= {n: getattr(f, n) for n in ("beam_share", "sigma_map", "sigma_map_yaw")}
-    leaves |= {f"odom_{n}": getattr(odom, n) for n in ("sigma_xy", "sigma_yaw", "sigma_floor")}
+    of_filter = ("gamma", "sigma_w", "sigma_w_paper", "sigma_w_yaw", "sigma_w_beacon", "sigma_l")
+    leaves: dict[str, Any] = {name: getattr(f, name) for name in of_filter}
+    leaves |= {name: getattr(f, name) for name in ("beam_share", "sigma_map", "sigma_map_yaw")}
+    leaves |= {f"odom_{name}": getattr(odom, name) for name in ("sigma_xy", "sigma_yaw", "sigma_floor")}
     leaves |= {"sigma_n": settings.uwb.sigma_n, "antenna": settings.robot.antenna[:2], "lidar": settings.robot.lidar}
-    return Params(**{name: jnp.asarray(value, jnp.float32) for name, value in leaves.items()}, bias=jnp.asarray(bias), height=jnp.asarray(height))
+    leaves |= {"bias": bias, "height": height}
+    return Params(**{name: jnp.asarray(value, jnp.float32) for name, value in leaves.items()})
 
 
 # Reading, checking and writing settings.

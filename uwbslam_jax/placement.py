@@ -6,6 +6,7 @@ Chains of poses with millimetre steps are beyond float32, and the problem runs o
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 
@@ -313,7 +314,7 @@ def _average(seen: list[tuple[np.ndarray, float]]) -> tuple[np.ndarray, float, i
 def _steps(keys: list[Keyframe]) -> tuple[np.ndarray, np.ndarray]:
     """Relative poses of consecutive keyframes and the roots of their information, in the earlier one's frame."""
     steps, roots = np.zeros((len(keys) - 1, 3)), np.zeros((len(keys) - 1, 3, 3))
-    for k, (a, b) in enumerate(zip(keys, keys[1:], strict=False)):
+    for k, (a, b) in enumerate(pairwise(keys)):
         R = rotation(a.pose[2]).T
         u = b.pose - a.pose
         steps[k] = np.append(R @ u[:2], u[2])
