@@ -1,0 +1,140 @@
+"""Aligning scans of a known room: near starts, the prior where the scan says nothing, and the wide search."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import small_room as room
+from derivatives import assert_gradient, double
+
+from uwbslam_jax import grid as occupancy
+from uwbslam_jax import matching
+from uwbslam_jax.ekf import Gaussian
+from uwbslam_jax.slam import undo_motion
+
+CELLS, LEVELS, RESOLUTION, BEAMS = 128, 3, 0.1, 180
+SIGMA_L = 0.25
+
+align = jax.jit(matching.align, static_argnums=5)
+assess = jax.jit(matching.assess, static_argnums=3)
+search = jax.jit(matching.search, static_argnums=4)
+
+
+def sweep_at(pose, beams=BEAMS, walls=room.WALLS):
+    scan = jax.tree.map(jnp.asarray, room.scan(np.array(pose, float), beams, walls))
+    return undo_motion(scan, jnp.zeros(3), jnp.zeros(2), jnp.zeros(()))
+
+
+THREE_PLACES = [(0.0, 0.0, 0.0), (-2.0, 2.0, 1.0), (2.0, -1.5, -1.0)] * 3
+
+
+def drawn(walls=room.WALLS, poses=THREE_PLACES):
+    """The room as seen from some places, often enough to be sure of it."""
+    grid = occupancy.empty(CELLS, LEVELS, RESOLUTION)
+    draw = jax.jit(occupancy.integrate, static_argnums=3)
+    for pose in poses:
+        grid = draw(grid, jnp.array(pose, jnp.float32), sweep_at(pose, 720, walls), RESOLUTION)
+    return grid
+
+
+@pytest.fixture(scope="module")
+def room_map():
+    return drawn()
+
+
+def wide(pose, sigma=0.5) -> Gaussian:
+    return Gaussian(jnp.asarray(pose, jnp.float32), jnp.diag(jnp.full(3, sigma**2, jnp.float32)))
+
+
+def aligned(grid, truth, start, prior=None, walls=room.WALLS):
+    prior = wide(start) if prior is None else prior
+    sweep = sweep_at(truth, walls=walls)
+    return align(grid, sweep, jnp.asarray(start, jnp.float32), prior, jnp.float32(SIGMA_L), RESOLUTION)
+
+
+@pytest.mark.parametrize("offset", [(0.2, -0.1, 0.1), (-0.15, 0.25, -0.12), (0.0, 0.0, 0.15), (0.0, 0.0, 0.0)])
+def test_scan_is_aligned_from_a_start_nearby(room_map, offset):
+    truth = np.array([0.33, -0.41, 0.6])
+    pose = aligned(room_map, truth, truth + offset)
+    # a map of 0.1 m cells holds a pose to a fifth of a cell and to that over the walls' distance
+    np.testing.assert_allclose(pose[:2], truth[:2], atol=0.02)
+    np.testing.assert_allclose(pose[2], truth[2], atol=0.006)
+
+
+def test_along_a_corridor_the_prior_holds_what_the_scan_does_not_see():
+    corridor = np.array([[[-30.0, -1.05], [30.0, -1.05]], [[30.0, 1.05], [-30.0, 1.05]]])
+    # walls without gaps to hold on to: drawn from many places along it
+    grid = drawn(corridor, [(x, 0.0, 0.0) for x in np.arange(-6.0, 6.1, 0.25)])
+    start = np.array([0.1, 0.1, 0.02])
+    pose = aligned(grid, np.array([0.0, 0.05, 0.0]), start, wide(start, 0.1), corridor)
+    np.testing.assert_allclose(pose[1:], [0.05, 0.0], atol=0.02)
+    np.testing.assert_allclose(pose[0], 0.1, atol=0.02)  # free to slide, and stays with the prior
+    found = assess(grid, sweep_at((0.0, 0.05, 0.0), walls=corridor), pose, RESOLUTION)
+    assert float(found.information[0, 0]) < 0.05 * float(found.information[1, 1])
+
+
+def test_a_scan_without_beams_stays_at_the_prior(room_map):
+    sweep = sweep_at((0.0, 0.0, 0.0))
+    blind = sweep._replace(valid=jnp.zeros(BEAMS, bool))
+    prior = wide((0.3, 0.2, 0.1))
+    pose = align(room_map, blind, jnp.zeros(3), prior, jnp.float32(SIGMA_L), RESOLUTION)
+    np.testing.assert_allclose(pose, prior.mean, atol=1e-3)  # the solver's own tolerance
+    found = assess(room_map, blind, pose, RESOLUTION)
+    assert float(found.known) == float(found.score) == 0.0
+
+
+def test_score_tells_a_right_pose_from_a_wrong_one(room_map):
+    truth = jnp.array([0.33, -0.41, 0.6])
+    sweep = sweep_at(truth)
+    right = assess(room_map, sweep, truth, RESOLUTION)
+    wrong = assess(room_map, sweep, truth + jnp.array([0.0, 0.0, 0.5]), RESOLUTION)
+    assert float(right.score) > 0.75
+    assert float(right.known) > 0.95
+    assert float(wrong.score) < 0.5
+    nowhere = assess(occupancy.empty(CELLS, LEVELS, RESOLUTION), sweep, truth, RESOLUTION)
+    assert float(nowhere.known) == 0.0
+
+
+@pytest.mark.parametrize("turn", [0.8, 1.6, -2.5, np.pi])
+def test_search_finds_the_heading_over_the_full_circle(room_map, turn):
+    truth = np.array([0.33, -0.41, 0.6])
+    off = truth + np.array([0.1, -0.15, turn])
+    prior = Gaussian(jnp.asarray(off, jnp.float32), jnp.diag(jnp.array([0.02, 0.02, 10.0])))
+    pose = np.asarray(search(room_map, sweep_at(truth), prior, jnp.float32(SIGMA_L), RESOLUTION), float)
+    np.testing.assert_allclose(pose[:2], truth[:2], atol=0.02)  # as above
+    np.testing.assert_allclose(np.exp(1j * pose[2]), np.exp(1j * truth[2]), atol=0.006)
+    assert abs(pose[2] - float(prior.mean[2])) <= np.pi + 1e-5  # the branch nearest to the prior
+
+
+@pytest.mark.usefixtures("x64")
+def test_one_move_of_gauss_newton_solves_a_linear_problem():
+    rng = np.random.default_rng(0)
+    A, b = jnp.asarray(rng.normal(size=(9, 4))), jnp.asarray(rng.normal(size=9))
+    x = matching.gauss_newton(lambda x, args: args[0] @ x - args[1], jnp.zeros(4), (A, b), 1)
+    np.testing.assert_allclose(x, np.linalg.lstsq(A, b)[0], rtol=1e-9)
+
+
+def test_a_problem_that_cannot_be_solved_does_not_raise():
+    x = matching.gauss_newton(lambda x, _: jnp.array([0.0, 1.0]) + 0 * x, jnp.ones(2), None, 3)
+    assert x.shape == (2,)
+
+
+@pytest.mark.usefixtures("x64")
+def test_gradient_of_an_alignment_agrees_with_finite_differences(room_map):
+    """Through all moves of all levels, as many as are made: by prior, start, map and sigma_l (reverse mode only)."""
+    grid, sweep = double(room_map), double(sweep_at((0.33, -0.41, 0.6), 60))
+    weights = jnp.array([1.0, -2.0, 0.5])
+
+    def value(at):
+        mean, start, level, sigma_l = at
+        changed = grid._replace(levels=(level, *grid.levels[1:]))
+        prior = Gaussian(mean, jnp.diag(jnp.array([0.1, 0.1, 0.05]) ** 2))
+        return weights @ matching.align(changed, sweep, start, prior, sigma_l, RESOLUTION)
+
+    truth = jnp.array([0.33, -0.41, 0.6])
+    at = (truth + 0.05, truth + jnp.array([0.06, -0.03, 0.02]), grid.levels[0], jnp.array(SIGMA_L))
+    assert_gradient(value, at, rtol=1e-4, atol=1e-7, step=1e-7, forward=False)
+
+
