@@ -85,6 +85,6 @@ class Tiles:
         return MapImage(whole, self.resolution, low[::-1] * side)
 
 
-def _block(level: int, row: int, col: int) -> tuple[slice, slice]:
+def _block(level: int, row: int | np.integer, col: int | np.integer) -> tuple[slice, slice]:
     size = TILE >> level
     return slice(row * size, (row + 1) * size), slice(col * size, (col + 1) * size)

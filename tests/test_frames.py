@@ -1,0 +1,294 @@
+"""Messages to frames: nothing is lost without being counted, whatever order and quality they come in."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from uwbslam_jax.config import LidarSettings, OdomSettings, Settings, UwbSettings
+from uwbslam_jax.frames import FrameAssembler, pad_scan
+from uwbslam_jax.measurements import OdometryMessage, RangeMessage, ScanMessage, StampedFrame, TruthMessage
+
+NAN, INF = float("nan"), float("inf")
+START = 1_700_000_000_000_000_000
+"""An epoch, which float32 cannot hold [ns]."""
+MAX_RANGES = 4
+
+
+def settings(**odom) -> Settings:
+    return Settings(
+        uwb=UwbSettings(max_beacons=2, max_range=50.0),
+        lidar=LidarSettings(max_beams=8, min_range=0.2, max_range=20.0),
+        odom=OdomSettings(**odom),
+    )
+
+
+def assembler(max_ranges: int = MAX_RANGES, **odom) -> FrameAssembler:
+    return FrameAssembler(settings(**odom), max_ranges)
+
+
+def at(seconds: float) -> int:
+    return START + round(seconds * 1e9)
+
+
+def scan(seconds: float, ranges=(1.0, 2.0, 3.0), increment: float = 0.1) -> ScanMessage:
+    return ScanMessage(at(seconds), -0.5, increment, 1e-4, 0.1, 10.0, np.array(ranges, np.float32))
+
+
+def ranged(seconds: float, a: int = 0, b: int = 1, distance: float = 5.0, **powers) -> RangeMessage:
+    return RangeMessage(at(seconds), a, b, distance, **powers)
+
+
+def odometry(seconds: float, x: float, y: float, yaw: float) -> OdometryMessage:
+    return OdometryMessage(at(seconds), x, y, yaw)
+
+
+def taken(frames: list[StampedFrame]) -> list[tuple[int, int, float]]:
+    """Slots and distance of all ranges in frames."""
+    found = []
+    for f in frames:
+        r = f.frame.ranges
+        found += [(int(r.i[k]), int(r.j[k]), float(r.range[k])) for k in np.flatnonzero(r.valid)]
+    return found
+
+
+def test_a_scan_closes_a_frame_with_the_ranges_before_it():
+    make = assembler()
+    frames = list(
+        make.frames(
+            [
+                ranged(0.0, 0, 7, 3.0, receive_power=-80.0, first_path_power=-92.5),
+                ranged(0.03, 9, 7, 4.0),
+                scan(0.1),
+                ranged(0.12, 0, 7, 3.5),
+                scan(0.2),
+            ]
+        )
+    )
+    assert [f.stamp for f in frames] == [at(0.1), at(0.2)]
+    first, second = (f.frame for f in frames)
+    assert taken(frames) == [(0, 1, 3.0), (2, 1, 4.0), (0, 1, 3.5)]
+    assert make.slots == frames[-1].slots == {0: 0, 7: 1, 9: 2}
+    np.testing.assert_allclose(first.ranges.age[:2], [-0.1, -0.07], atol=1e-7)  # float32
+    assert float(first.ranges.power_gap[0]) == 12.5
+    assert np.isnan(first.ranges.power_gap[1:]).all()
+    assert bool(first.has_scan)
+    assert float(first.dt) == 0.0
+    np.testing.assert_allclose(second.dt, 0.1, rtol=1e-6)
+    assert not make.dropped
+    # empty slots name two different nodes
+    assert (first.ranges.i[2:] != first.ranges.j[2:]).all()
+
+
+def test_a_range_that_arrives_before_its_scan_waits_for_the_next():
+    frames = list(assembler().frames([ranged(0.15), scan(0.1), scan(0.2)]))
+    assert [len(taken([f])) for f in frames] == [0, 1]
+    np.testing.assert_allclose(frames[1].frame.ranges.age[0], -0.05, atol=1e-7)
+
+
+@pytest.mark.parametrize("distance", [NAN, INF, -INF, -1.0, 0.0, 50.1, 1e30])
+def test_impossible_ranges_are_dropped_and_counted(distance):
+    make = assembler()
+    frames = list(make.frames([ranged(0.0, distance=distance), scan(0.1)]))
+    assert taken(frames) == []
+    assert make.dropped == {"range: not finite, not positive or too long": 1}
+    assert make.slots == {0: 0}  # and give no slot to a node
+
+
+def test_duplicates_are_dropped_and_counted_in_either_direction():
+    make = assembler()
+    frames = list(make.frames([ranged(0.0), ranged(0.0), ranged(0.0, 1, 0), scan(0.1), scan(0.1)]))
+    assert len(taken(frames)) == 1
+    assert make.dropped == {
+        "range: stamp not after the pair's one before": 2,
+        "scan: stamp not after the one before": 1,
+    }
+
+
+def test_stamps_out_of_order_are_dropped_and_counted():
+    make = assembler()
+    stream = [scan(1.0), scan(0.9), ranged(1.05), ranged(1.02), ranged(0.3, 0, 2), ranged(0.97, 1, 2), scan(1.1)]
+    frames = list(make.frames(stream))
+    assert [f.stamp for f in frames] == [at(1.0), at(1.1)]
+    # a little late is still used, by its age
+    assert taken(frames[1:]) == [(1, 2, 5.0), (0, 1, 5.0)]
+    np.testing.assert_allclose(frames[1].frame.ranges.age[:2], [-0.13, -0.05], atol=1e-6)
+    assert make.dropped == {
+        "scan: stamp not after the one before": 1,
+        "range: stamp not after the pair's one before": 1,
+        "range: arrived too late": 1,
+    }
+
+
+def test_a_node_that_ranges_to_itself_is_dropped_and_counted():
+    make = assembler()
+    list(make.frames([ranged(0.0, 3, 3), scan(0.1)]))
+    assert make.dropped == {"range: a node to itself": 1}
+
+
+def test_ids_beyond_max_beacons_are_dropped_and_counted():
+    make = assembler()
+    frames = list(make.frames([ranged(0.0, 0, 4_000_000_000), ranged(0.01, 0, 5), ranged(0.02, 0, 6), scan(0.1)]))
+    assert len(taken(frames)) == 2
+    assert make.slots == {0: 0, 4_000_000_000: 1, 5: 2}
+    assert make.dropped == {"range: more beacons than max_beacons": 1}
+
+
+def test_more_ranges_than_a_frame_holds_make_more_frames_or_are_counted():
+    make = assembler(max_ranges=2)
+    many = [ranged(0.01 * k, *pair) for k, pair in enumerate([(0, 1), (0, 2), (1, 2), (1, 0), (2, 0)], start=1)]
+    frames = list(make.frames([scan(0.0), *many, scan(0.1)]))
+    assert len(taken(frames)) == 5
+    assert max(len(taken([f])) for f in frames) <= 2
+    assert not make.dropped
+    # all at the stamp of the scan: there is no time for a frame before it
+    at_once = [ranged(0.2, *pair) for pair in [(0, 1), (0, 2), (1, 2)]]
+    frames = [f for m in [*at_once, scan(0.2)] for f in make.add(m)]
+    assert len(taken(frames)) + make.dropped["range: more than one frame holds"] == 3
+
+
+@pytest.mark.parametrize("bad", [scan(0.0, ()), scan(0.0, (1.0,)), scan(0.0, increment=NAN)])
+def test_a_scan_without_beams_or_bearings_is_dropped_and_counted(bad):
+    make = assembler()
+    assert list(make.frames([bad])) == []
+    assert make.dropped == {"scan: no beams or no bearings": 1}
+
+
+def test_readings_outside_limits_are_no_return():
+    readings = [0.0, NAN, INF, -1.0, 0.15, 0.25, 9.9, 10.1]
+    padded = pad_scan(scan(0.0, readings), settings())  # 0.2 is the setting's limit, 10 the sensor's
+    np.testing.assert_array_equal(padded.valid, [False] * 5 + [True, True, False])
+    np.testing.assert_allclose(padded.ranges, [0, 0, 0, 0, 0, 0.25, 9.9, 0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("beams", [2, 7, 8, 9, 16, 17, 1081])
+@pytest.mark.parametrize("increment", [0.01, -0.01], ids=["counter-clockwise", "upside down"])
+def test_beams_keep_their_bearing_and_time_when_thinned(beams, increment):
+    readings = 1.0 + 0.001 * np.arange(beams)
+    message = scan(0.0, readings, increment)
+    padded = pad_scan(message, settings())
+    kept = np.flatnonzero(padded.valid)
+    stride = -(-beams // 8)
+    assert len(kept) == -(-beams // stride) <= 8
+    original = np.round((padded.ranges[kept] - 1.0) / 0.001).astype(int)
+    np.testing.assert_allclose(
+        padded.angle_min + padded.angle_increment * kept, -0.5 + increment * original, rtol=1e-5, atol=1e-6
+    )
+    np.testing.assert_allclose(padded.time_increment * kept, 1e-4 * original, rtol=1e-5)
+    assert np.sign(padded.angle_increment) == np.sign(increment)
+    np.testing.assert_array_equal(original, np.arange(0, beams, stride))  # evenly over the whole sweep
+
+
+def test_odometry_is_interpolated_between_its_stamps_and_put_into_the_robots_frame():
+    """Heading +y, driving forward 1 m/s: the increment is along the robot's x."""
+    stream = [odometry(0.04 * k, 3.0, 0.04 * k, np.pi / 2) for k in range(4)]
+    make = assembler()
+    frames = list(make.frames([*stream, scan(0.05), scan(0.1)]))
+    assert not bool(frames[0].frame.odometry.valid)  # there is no frame before
+    assert bool(frames[1].frame.odometry.valid)
+    np.testing.assert_allclose(frames[1].frame.odometry.increment, [0.05, 0.0, 0.0], atol=1e-6)
+    assert make.odometry_used
+
+
+def test_odometry_turn_goes_the_short_way_round():
+    stream = [odometry(0.0, 0.0, 0.0, 3.1), odometry(0.1, 0.0, 0.0, -3.1), odometry(0.2, 0.0, 0.0, -3.0)]
+    frames = list(assembler().frames([*stream, scan(0.0), scan(0.05), scan(0.15)]))
+    turn = 2 * np.pi - 6.2
+    np.testing.assert_allclose(frames[1].frame.odometry.increment[2], turn / 2, atol=1e-6)
+    np.testing.assert_allclose(frames[2].frame.odometry.increment[2], turn / 2 + 0.05, atol=1e-6)
+
+
+def test_odometry_that_lags_is_held_for_a_moment_and_then_not_used():
+    stream = [odometry(0.1 * k, 0.1 * k, 0.0, 0.0) for k in range(4)]  # up to 0.3 s
+    frames = list(assembler().frames([*stream, scan(0.2), scan(0.5), scan(0.7)]))
+    valid = [bool(f.frame.odometry.valid) for f in frames]
+    assert valid == [False, True, False]
+    np.testing.assert_allclose(frames[1].frame.odometry.increment, [0.3, 0.0, 0.0], atol=1e-6)  # at the last speed
+
+
+def test_bad_odometry_is_dropped_and_counted_and_may_be_switched_off():
+    bad = [odometry(0.0, 0, 0, 0), odometry(0.0, 1, 0, 0), odometry(0.1, NAN, 0, 0), odometry(0.2, 0, 0, INF)]
+    make = assembler()
+    list(make.frames(bad))
+    assert make.dropped == {"odometry: stamp not after the one before": 1, "odometry: not finite": 2}
+    off = assembler(use=False)
+    stream = [odometry(0.05 * k, 0.1 * k, 0.0, 0.0) for k in range(5)]
+    frames = list(off.frames([*stream, scan(0.1), scan(0.2)]))
+    assert not any(bool(f.frame.odometry.valid) for f in frames)
+    assert not off.odometry_used
+
+
+def test_ranges_without_scans_make_frames_of_about_a_second():
+    make = assembler(max_ranges=32)
+    stream = [ranged(0.1 * k, 0, 1 + k % 2, 1.0 + 0.1 * k) for k in range(100)]
+    online = [f for m in stream for f in make.add(m)]
+    frames = online + make.flush()
+    assert len(taken(frames)) == 100
+    assert not any(bool(f.frame.has_scan) or f.frame.scan.valid.any() for f in frames)
+    assert len(online) >= 7  # they do not all wait for the end
+    assert len(frames) <= 12
+    assert not make.dropped
+    for f in frames:
+        assert f.frame.ranges.age[f.frame.ranges.valid].min() >= -1.0 - 1e-6
+
+
+def test_a_gap_between_scans_does_not_lose_its_ranges():
+    make = assembler(max_ranges=32)
+    stream = [scan(0.0), *[ranged(0.1 + 0.1 * k, 0, 1, 1.0 + k) for k in range(45)], scan(4.7), ranged(4.8), scan(4.9)]
+    frames = list(make.frames(stream))
+    assert len(taken(frames)) == 46
+    assert sum(bool(f.frame.has_scan) for f in frames) == 3
+    np.testing.assert_allclose(sum(float(f.frame.dt) for f in frames), 4.9, atol=1e-5)
+
+
+def test_flush_hands_over_what_still_waits_and_only_once():
+    make = assembler()
+    assert make.add(scan(0.0))
+    assert not make.add(ranged(0.1))
+    assert len(taken(make.flush())) == 1
+    assert make.flush() == []
+
+
+def test_ground_truth_never_reaches_a_frame():
+    make = assembler()
+    stream = [TruthMessage(at(0.0), None, 9.0, 9.0, 9.0), TruthMessage(at(0.0), 1, 9.0, 9.0), scan(0.1)]
+    frames = list(make.frames(stream))
+    assert len(frames) == 1
+    assert make.slots == {0: 0}
+    assert not make.dropped
+
+
+messages = st.one_of(
+    st.builds(scan, st.floats(0, 8)),
+    st.builds(ranged, st.floats(0, 8), st.integers(0, 3), st.integers(0, 3), st.floats(allow_nan=True)),
+    st.builds(odometry, st.floats(0, 8), *[st.floats(-5, 5)] * 3),
+)
+
+
+@given(st.lists(messages, max_size=60), st.booleans())
+def test_every_message_is_in_a_frame_or_counted(stream, in_order):
+    if in_order:
+        stream = sorted(stream, key=lambda m: m.stamp)
+    make = assembler()
+    frames = list(make.frames(stream))
+    stamps = [f.stamp for f in frames]
+    assert all(b > a for a, b in itertools.pairwise(stamps))
+    steps = np.diff(stamps) / 1e9
+    np.testing.assert_allclose([f.frame.dt for f in frames[1:]], steps, rtol=1e-6)
+    for name, kind, used in [
+        ("range", RangeMessage, len(taken(frames))),
+        ("scan", ScanMessage, sum(bool(f.frame.has_scan) for f in frames)),
+    ]:
+        lost = sum(count for reason, count in make.dropped.items() if reason.startswith(name))
+        assert used + lost == sum(isinstance(m, kind) for m in stream)
+    for f in frames:
+        r = f.frame.ranges
+        assert (r.age[r.valid] <= 0).all()
+        assert (r.i < 3).all()
+        assert (r.j < 3).all()
+        assert (r.i[r.valid] != r.j[r.valid]).all()
+        assert all(np.isfinite(leaf).all() for leaf in (r.range, r.age, f.frame.odometry.increment, f.frame.dt))
