@@ -1,0 +1,193 @@
+"""Start-up: what is said before the beacons are placed, which mirror image it is, and the change of frame."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import start_of_run
+from start_of_run import BEACONS, IDS, SETTINGS
+
+from uwbslam_jax import geometry, layout, slam, startup
+from uwbslam_jax.config import make_config, make_params
+
+TRUTH = np.array(list(BEACONS.values()))
+CONFIG, PARAMS = make_config(SETTINGS), make_params(SETTINGS)
+
+
+def solved(poses, **options) -> startup.Outcome:
+    return startup.solve(start_of_run.buffer(poses, **options), IDS)
+
+
+def test_at_rest_it_waits_for_motion():
+    outcome = solved(start_of_run.straight(0.6))
+    assert (outcome.status, outcome.hypotheses, outcome.placement) == ("waiting for motion", 0, None)
+
+
+def test_an_empty_buffer_waits_for_motion():
+    empty = startup.Buffer(np.zeros(2), np.zeros(4), np.zeros(4), 0.1)
+    assert startup.solve(empty, IDS).status == "waiting for motion"
+
+
+def test_one_beacon_alone_makes_no_frame():
+    outcome = solved(start_of_run.with_a_turn(), beacons={1: BEACONS[1]})
+    assert outcome.status == "placing beacons"
+    assert outcome.placement is None
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_on_a_straight_path_the_reflection_is_undecided(seed):
+    outcome = solved(start_of_run.straight(), seed=seed, antenna=(0.0, 0.0))
+    assert outcome.status == "reflection undecided"
+    assert outcome.hypotheses == 2
+    assert outcome.margin < 3.0  # DESIGN 1.7: 0.5-3 on a straight path
+    assert outcome.placement is None
+
+
+@pytest.mark.parametrize("side", [1, -1], ids=["left", "right"])
+@pytest.mark.parametrize("seed", range(2))
+def test_after_a_turn_the_mirror_images_are_told_apart(seed, side):
+    """A mirrored world makes every left turn a right turn: the same beacons seen from the other turn are mirrored."""
+    poses = start_of_run.with_a_turn() * [1, side, side]
+    outcome = solved(poses, seed=seed)
+    assert outcome.status == "decided"
+    assert outcome.margin > 100.0
+    assert outcome.placement.slots == [1, 2, 3]
+    np.testing.assert_allclose(outcome.placement.beacons, TRUTH, atol=0.1)
+
+
+def test_published_frame_has_the_lowest_id_at_the_origin_and_the_farthest_beacon_on_x():
+    outcome = solved(start_of_run.with_a_turn())
+    # slot 3 is 9.9 m from slot 1 and 8.1 m from slot 2
+    assert startup.choose_frame(outcome.placement, {0: 0, 1: 30, 2: 12, 3: 7}) == (3, 1)
+
+
+def adopted_case():
+    """A decided start, and a LiDAR-only state that has driven a little on from the last keyframe."""
+    kept = start_of_run.buffer(start_of_run.with_a_turn())
+    outcome = startup.solve(kept, IDS)
+    state = slam.init(CONFIG)
+    pose = kept.keyframes[-1].pose + np.array([0.05, 0.1, 0.02])
+    s = layout.unpack(state.belief.mean)
+    mean = layout.pack(
+        s._replace(
+            positions=s.positions.at[0].set(jnp.asarray(pose[:2])),
+            velocities=s.velocities.at[0].set(jnp.array([0.3, 0.7])),
+            heading=jnp.float32(pose[2]),
+            yaw_rate=jnp.float32(0.1),
+        )
+    )
+    state = state._replace(belief=state.belief._replace(mean=mean))
+    frame_slots = startup.choose_frame(outcome.placement, IDS)
+    adopted = startup.adopt(CONFIG, PARAMS, state, kept, outcome.placement, frame_slots)
+    return outcome.placement, state, frame_slots, adopted, pose
+
+
+def published(x: np.ndarray, onward: np.ndarray, frame: tuple[int, int]) -> np.ndarray:
+    """Robot and beacons in the frame of two beacons, by homogeneous matrices."""
+
+    def matrix(p):
+        return np.array([[np.cos(p[2]), -np.sin(p[2]), p[0]], [np.sin(p[2]), np.cos(p[2]), p[1]], [0, 0, 1]])
+
+    beacons = x[3:].reshape(-1, 2)
+    origin, along = beacons[frame[0] - 1], beacons[frame[1] - 1]
+    G = np.linalg.inv(matrix([*origin, np.arctan2(*(along - origin)[::-1])]))
+    robot = G @ matrix(x[:3]) @ matrix(onward)
+    moved = [(G @ [*b, 1.0])[:2] for b in beacons]
+    return np.concatenate([robot[:2, 2], [np.arctan2(robot[1, 0], robot[0, 0])], np.ravel(moved)])
+
+
+def test_adopted_state_is_the_start_in_the_published_frame():
+    placement, state, frame, adopted, pose = adopted_case()
+    onward = startup.between(_last_key(), pose)
+    want = published(np.concatenate([placement.poses[-1], placement.beacons.ravel()]), onward, frame)
+    s = layout.unpack(adopted.state.belief.mean)
+    np.testing.assert_allclose(s.positions[0], want[:2], atol=1e-4)  # float32 of some metres
+    np.testing.assert_allclose(np.exp(1j * float(s.heading)), np.exp(1j * want[2]), atol=1e-5)
+    np.testing.assert_allclose(s.positions[1:], want[3:].reshape(-1, 2), atol=1e-5)
+    np.testing.assert_allclose(s.positions[frame[0]], 0.0, atol=1e-6)
+    assert float(s.positions[frame[1], 0]) > 0
+    np.testing.assert_array_equal(adopted.state.active, True)
+    # the velocity turns with the frame: the same speed, the same angle against the heading
+    v, before = np.asarray(s.velocities[0]), np.array([0.3, 0.7])
+    np.testing.assert_allclose(np.hypot(*v), np.hypot(*before), rtol=1e-6)
+    turned = np.asarray(geometry.rotation(-s.heading) @ s.velocities[0])
+    np.testing.assert_allclose(turned, startup.rotation(-pose[2]) @ before, atol=1e-5)
+    assert float(s.yaw_rate) == float(layout.unpack(state.belief.mean).yaw_rate)
+
+
+def _last_key() -> np.ndarray:
+    return start_of_run.with_a_turn()[-1]
+
+
+def test_adopted_covariance_is_that_of_samples_put_through_the_change_of_frame():
+    placement, _, frame, adopted, pose = adopted_case()
+    n = placement.poses.size
+    x = np.concatenate([placement.poses[-1], placement.beacons.ravel()])
+    cov = placement.cov[n - 3 :, n - 3 :]
+    onward = startup.between(_last_key(), pose)
+    # a tenth of the spread, so that the map is linear over the samples
+    samples = np.random.default_rng(0).multivariate_normal(x, cov / 100, 4000)
+    mapped = np.array([published(sample, onward, frame) for sample in samples])
+    want = 100 * np.cov(mapped.T)
+    P = np.asarray(adopted.state.belief.cov)
+    nodes = CONFIG.nodes
+    at = [*layout.pose_indices(nodes), *range(2, 2 * nodes)]
+    # a sample covariance of 4000 is right to 2.2 % of each pair's spread; four times that
+    spread = np.sqrt(np.diag(want))
+    np.testing.assert_allclose(P[np.ix_(at, at)], want, atol=0.09 * np.outer(spread, spread).max())
+    for known in (2 * frame[0], 2 * frame[0] + 1, 2 * frame[1] + 1):
+        assert P[known, known] < 1e-10  # the frame's own coordinates
+    error = np.array(layout.map_error_indices(nodes))
+    robot = np.array(layout.pose_indices(nodes))
+    C = np.asarray(layout.matched_pose_jacobian(nodes))
+    # what a match reports is known: the map was drawn at the estimated poses
+    np.testing.assert_allclose(C @ P @ C.T, 0.0, atol=1e-8)
+    np.testing.assert_allclose(P[np.ix_(error, error)], P[np.ix_(robot, robot)], atol=1e-10)
+    assert np.linalg.eigvalsh((P + P.T) / 2).min() > -1e-7
+
+
+def test_earlier_poses_are_republished_with_the_keyframe_before_them():
+    placement, _, _, adopted, _ = adopted_case()
+    track = start_of_run.with_a_turn()
+    np.testing.assert_allclose(adopted.republish(adopted.anchors, track), adopted.after, atol=1e-9)
+    # a pose between two keyframes keeps its place relative to the earlier one
+    later = track[3] + np.array([0.1, 0.02, 0.05])
+    moved = adopted.republish(adopted.anchors[3:4] + 1, later[None])
+    np.testing.assert_allclose(
+        startup.between(adopted.after[3:4], moved), startup.between(track[3:4], later[None]), atol=1e-9
+    )
+    # before the first keyframe: by the first
+    first = adopted.republish(np.array([adopted.anchors[0] - 5]), track[:1])
+    np.testing.assert_allclose(first, adopted.after[:1], atol=1e-9)
+    assert len(placement.poses) == len(adopted.after)
+
+
+def test_host_compose_and_between_are_those_of_the_device():
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=(2, 3))
+    device = geometry.compose(jnp.asarray(a), jnp.asarray(b))
+    np.testing.assert_allclose(startup.compose(a, b), device, atol=1e-6)  # float32
+    np.testing.assert_allclose(startup.compose(a, startup.between(a, b)), b, atol=1e-12)
+
+
+def test_a_long_start_is_thinned_without_losing_ranges():
+    kept = start_of_run.buffer(start_of_run.with_a_turn())
+    before = sum(len(seen) for key in kept.keyframes for seen in key.seen.values())
+    places = [_antennas(kept)]
+    count = len(kept.keyframes)
+    kept._thin()
+    assert count / 2 <= len(kept.keyframes) <= count / 2 + 2
+    assert sum(len(seen) for key in kept.keyframes for seen in key.seen.values()) == before
+    places.append(_antennas(kept))
+    np.testing.assert_allclose(*places, atol=1e-9)  # each range still stands where it was taken
+
+
+def _antennas(kept) -> np.ndarray:
+    found = [
+        key.pose[:2] + startup.rotation(key.pose[2]) @ local
+        for key in kept.keyframes
+        for _, seen in sorted(key.seen.items())
+        for local, _ in seen
+    ]
+    return np.array(sorted(map(tuple, np.round(found, 9))))
