@@ -52,7 +52,7 @@ def to_frame(vector: Float[Array, "n"], frame_slots: Int[Array, "2"]) -> Float[A
     R = rotation(motion[2])
     velocities = (s.velocities @ R.T).at[frame_slots].set(0.0)
     return layout.pack(
-        s._replace(positions=s.positions @ R.T + motion[:2], velocities=velocities, heading=s.heading + motion[2])
+        s._replace(positions=s.positions @ R.T + motion[None, :2], velocities=velocities, heading=s.heading + motion[2])
     )
 
 
