@@ -16,6 +16,9 @@ _SOFT = 4.0
 """Whitened residual at which a range's influence starts to fall (Geman-McClure)."""
 _RANGE_FLOOR_M = 0.02
 """However many ranges are averaged, their mean is not better than this."""
+_MOST_MOVES = 20
+_ENOUGH = 0.02
+"""The batch problem is solved when a move gains less log-likelihood than this."""
 DECIDED = 15.0
 """Difference of log-likelihood that decides between two explanations."""
 SIGMA_ENOUGH_M = 0.15
@@ -186,7 +189,7 @@ class Problem:
         poses, damping = self.track.copy(), 1e-3
         J, r = self._linearise(poses, beacons)
         cost = 0.5 * r @ r
-        for _ in range(30):
+        for _ in range(_MOST_MOVES):
             A, g = J.T @ J, J.T @ r
             move = -np.linalg.solve(A + damping * np.diag(np.diag(A) + 1e-9), g)
             new_poses = poses + move[: poses.size].reshape(-1, 3)
@@ -194,7 +197,7 @@ class Problem:
             new_J, new_r = self._linearise(new_poses, new_beacons)
             new_cost = 0.5 * new_r @ new_r
             if new_cost < cost:
-                done = cost - new_cost < 1e-4
+                done = cost - new_cost < _ENOUGH
                 poses, beacons, J, r, cost = new_poses, new_beacons, new_J, new_r, new_cost
                 damping = max(damping / 5, 1e-9)
                 if done:
@@ -219,19 +222,22 @@ class Problem:
         return J, 1e4 * (poses[0] - self.track[0])
 
     def _step_rows(self, poses, columns):
-        m = len(self.steps)
-        J, r = np.zeros((m, 3, columns)), np.zeros((m, 3))
-        for k in range(m):
-            R = rotation(poses[k, 2]).T
-            u = poses[k + 1, :2] - poses[k, :2]
-            e = np.append(R @ u, poses[k + 1, 2] - poses[k, 2]) - self.steps[k]
-            local = np.zeros((3, 6))
-            local[:2, :2], local[:2, 3:5] = -R, R
-            local[:2, 2] = -R @ np.array([-u[1], u[0]])
-            local[2, 2], local[2, 5] = -1.0, 1.0
-            J[k, :, 3 * k : 3 * k + 6] = self.roots[k] @ local
-            r[k] = self.roots[k] @ e
-        return J.reshape(-1, columns), r.ravel()
+        a, b = poses[:-1], poses[1:]
+        m = len(a)
+        c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
+        R = np.stack([np.stack([c, s], -1), np.stack([-s, c], -1)], 1)  # (m, 2, 2), world to the earlier pose
+        u = b[:, :2] - a[:, :2]
+        moved = np.einsum("mij,mj->mi", R, u)
+        e = np.column_stack([moved, b[:, 2] - a[:, 2]]) - self.steps
+        local = np.zeros((m, 3, 6))
+        local[:, :2, :2], local[:, :2, 3:5] = -R, R
+        local[:, :2, 2] = -np.einsum("mij,mj->mi", R, np.stack([-u[:, 1], u[:, 0]], -1))
+        local[:, 2, 2], local[:, 2, 5] = -1.0, 1.0
+        J = np.zeros((m, 3, columns))
+        rows = np.arange(m)
+        for k in range(6):
+            J[rows, :, 3 * rows + k] = np.einsum("mij,mj->mi", self.roots, local[:, :, k])
+        return J.reshape(-1, columns), np.einsum("mij,mj->mi", self.roots, e).ravel()
 
     def _range_rows(self, poses, beacons, columns):
         antenna = self._antenna(poses)
@@ -324,7 +330,7 @@ def _steps(keys: list[Keyframe]) -> tuple[np.ndarray, np.ndarray]:
         # where the match says nothing, the motion model still bounds the step; where it says much, the map it was
         # matched with has its own drift
         loose = np.diag([0.1 + 0.2 * length, 0.1 + 0.2 * length, 0.05 + 0.1 * abs(u[2])]) ** 2
-        tight = np.diag([0.005 + 0.01 * length, 0.005 + 0.01 * length, 0.002 + 0.01 * abs(u[2])]) ** 2
+        tight = np.diag([0.005 + 0.01 * length, 0.005 + 0.01 * length, 0.002 + 0.003 * abs(u[2])]) ** 2
         cov = np.linalg.inv(turn @ b.information @ turn.T + np.linalg.inv(loose)) + tight
         roots[k] = np.linalg.cholesky(np.linalg.inv(cov)).T
     return steps, roots

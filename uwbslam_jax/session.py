@@ -78,7 +78,7 @@ class Session:
         self.hypotheses = 0
         self._slots: dict[int, int] = {settings.robot.id: 0}
         self._pending: list[tuple[StampedFrame, Estimate]] = []
-        self._solved_at = 0
+        self._solved_at = self._solved_with = 0
         self._buffer = self._new_buffer()
         self._keeper = BeaconKeeper(settings)
 
@@ -144,9 +144,9 @@ class Session:
         for frame, estimate in pending:
             self._buffer.add(frame, estimate, startup.usable(frame.frame.ranges, self.config.nlos_gap_db))
         now = pending[-1][0].stamp
-        if now - self._solved_at < _SOLVE_EVERY_S * 1e9:
-            return
-        self._solved_at = now
+        if now - self._solved_at < _SOLVE_EVERY_S * 1e9 or self._buffer.newest == self._solved_with:
+            return  # nothing can have been learnt but better averages
+        self._solved_at, self._solved_with = now, self._buffer.newest
         ids = {slot: node for node, slot in self._slots.items()}
         outcome = startup.solve(self._buffer, ids)
         if outcome.status != self.status:

@@ -47,6 +47,11 @@ class Buffer:
             return 0.0
         return max(float(np.linalg.norm(k.pose[:2] - self.keyframes[0].pose[:2])) for k in self.keyframes)
 
+    @property
+    def newest(self) -> int:
+        """Stamp of the newest keyframe [ns], 0 without any."""
+        return self.keyframes[-1].frame.stamp if self.keyframes else 0
+
     def add(self, frame: StampedFrame, estimate: Estimate, usable: np.ndarray) -> None:
         """Take in one frame with the pose that LiDAR (and odometry) gave it, and which of its ranges may be used."""
         pose = np.asarray(estimate.pose, float)
