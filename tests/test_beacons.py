@@ -1,0 +1,207 @@
+"""A beacon's life after start-up: placed when its place is certain, silent, dropped, carried away, back again."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import small_room as room
+
+from uwbslam_jax import layout, slam
+from uwbslam_jax.beacons import BeaconKeeper
+from uwbslam_jax.config import Params, Settings, UwbSettings, make_config, make_params
+from uwbslam_jax.frames import pad_scan
+from uwbslam_jax.measurements import Frame, StampedFrame
+from uwbslam_jax.slam import Estimate, State
+
+SETTINGS = Settings(uwb=UwbSettings(max_beacons=3, sigma_n=0.1))
+CONFIG = make_config(SETTINGS)
+BEACONS = np.array([[0.0, 0.0], [4.0, 0.0], [1.0, 5.0], [-3.0, 2.0]])
+"""Slot 0 is the robot's and not used."""
+SECOND = 10**9
+
+
+def params(**changed) -> Params:
+    return make_params(SETTINGS)._replace(**changed)
+
+
+def known(*slots: int) -> State:
+    """A state that has some beacons at their places."""
+    state = slam.init(CONFIG)
+    active = np.isin(np.arange(4), [0, *slots])
+    s = layout.unpack(state.belief.mean)
+    positions = jnp.asarray(np.where(active[:, None], BEACONS, 0.0), jnp.float32)
+    belief = state.belief._replace(mean=layout.pack(s._replace(positions=positions)))
+    return state._replace(belief=belief, active=jnp.asarray(active))
+
+
+class World:
+    """A robot on a circle that hands frames and estimates to a keeper, ten a look."""
+
+    def __init__(self, state: State, *, straight: bool = False, params: Params | None = None, seed: int = 0):
+        self.keeper, self.state = BeaconKeeper(SETTINGS), state
+        self.params = make_params(SETTINGS) if params is None else params
+        self.positions = BEACONS.copy()
+        self.events: list[tuple[float, int, str]] = []
+        self.time = 0.0
+        self.excess = np.zeros(4)
+        self._straight, self._rng = straight, np.random.default_rng(seed)
+        for slot in np.flatnonzero(np.asarray(state.active)[1:]) + 1:
+            self.keeper.placed(int(slot), 0)
+
+    def pose(self) -> np.ndarray:
+        if self._straight:
+            return np.array([0.3 * self.time, 0.0, 0.0])
+        a = 0.3 * self.time
+        return np.array([2 * np.cos(a), 2 * np.sin(a), a + np.pi / 2])
+
+    def run(self, seconds: float, heard: tuple[int, ...], dt: float = 0.1, gap: float = np.nan) -> None:
+        pending = []
+        for _ in range(round(seconds / dt)):
+            self.time += dt
+            pending.append(self._measure([(0, slot) for slot in heard], gap))
+            if len(pending) == 10:
+                self._look(pending)
+                pending = []
+
+    def _measure(self, pairs, gap) -> tuple[StampedFrame, Estimate]:
+        pose, estimated = self.pose(), np.asarray(self.state.belief.mean[:8], float).reshape(4, 2)
+        c, s = np.cos(pose[2]), np.sin(pose[2])
+        ax, ay = np.asarray(self.params.antenna, float)
+        antenna = pose[:2] + np.array([c * ax - s * ay, s * ax + c * ay])
+        slots = [j for _, j in pairs]
+        rise = np.asarray(self.params.height)[slots] - float(self.params.height[0])
+        bias = np.asarray(self.params.bias)[slots] + float(self.params.bias[0])
+
+        def slant(points):
+            return np.hypot(np.linalg.norm(points[slots] - antenna, axis=1), rise) + bias
+
+        z = slant(self.positions) + self.excess[slots] + 0.1 * self._rng.normal(size=len(slots))
+        ranges = room.ranges(pairs, z, CONFIG.max_ranges, gap=gap)
+        normalised = np.zeros(CONFIG.max_ranges, np.float32)
+        normalised[: len(slots)] = (z - slant(estimated)) / 0.12
+        frame = Frame(np.float32(0.1), np.bool_(False), pad_scan(None, SETTINGS), ranges, room.no_odometry())
+        zero = np.zeros((), np.float32)
+        empty = dict.fromkeys(Estimate._fields, zero)
+        active = np.asarray(self.state.active)
+        known = {"pose": pose, "velocity": np.zeros(2), "beacons": estimated, "active": active}
+        known["normalised"] = normalised
+        return StampedFrame(round(self.time * SECOND), frame), Estimate._make({**empty, **known}.values())
+
+    def _look(self, pending) -> None:
+        self.state, events = self.keeper.look(self.state, self.params, pending)
+        self.events += [(self.time, slot, text) for slot, text in events]
+
+    def position(self, slot: int) -> np.ndarray:
+        return np.asarray(layout.unpack(self.state.belief.mean).positions[slot], float)
+
+
+def test_a_beacon_that_joins_is_placed_where_it_stands_within_its_stated_covariance():
+    world = World(known(1, 2))
+    before = world.state
+    world.run(12.0, (1, 2, 3))
+    assert world.keeper.status(3) == "static"
+    assert [(slot, text) for _, slot, text in world.events] == [(3, "placed")]
+    np.testing.assert_array_equal(world.state.active, True)
+    P = np.asarray(world.state.belief.cov, float)
+    error = world.position(3) - BEACONS[3]
+    assert error @ np.linalg.solve(P[6:8, 6:8], error) < 13.8  # chi-square of 2, 1 in 1000
+    assert np.sqrt(P[6, 6]) < 0.15
+    # the rest is as it was, and independent of it
+    np.testing.assert_array_equal(world.position(2), BEACONS[2])
+    others = np.setdiff1d(np.arange(len(P)), [6, 7])
+    np.testing.assert_array_equal(P[6:8][:, others], 0.0)
+    kept = np.setdiff1d(others, [14, 15])  # its velocity
+    np.testing.assert_array_equal(P[np.ix_(kept, kept)], np.asarray(before.belief.cov)[np.ix_(kept, kept)])
+    np.testing.assert_allclose(np.diag(P)[14:16], 1e-8, rtol=1e-5)
+
+
+def test_lever_arm_height_and_bias_are_taken_off_before_placing():
+    biased = params(
+        antenna=jnp.array([0.3, -0.2]), bias=jnp.array([0.1, 0, 0, 0.25]), height=jnp.array([1.0, 1.0, 1.0, 2.5])
+    )
+    world = World(known(1, 2), params=biased)
+    world.run(12.0, (1, 2, 3))
+    np.testing.assert_allclose(world.position(3), BEACONS[3], atol=0.1)  # 12 and more ranges of 0.1 m
+
+
+def test_a_beacon_seen_from_a_straight_line_only_is_not_placed():
+    world = World(known(1, 2), straight=True)
+    world.run(12.0, (1, 2, 3))
+    assert world.keeper.status(3) == "waiting"
+    assert not bool(world.state.active[3])
+
+
+def test_a_beacon_behind_walls_by_its_powers_is_not_placed():
+    world = World(known(1, 2))
+    world.run(12.0, (3,), gap=20.0)
+    assert world.keeper.status(3) == "waiting"
+
+
+def test_a_silent_beacon_keeps_its_place_and_is_dropped_after_a_minute():
+    world = World(known(1, 2, 3))
+    world.run(5.0, (1, 2))
+    assert world.keeper.status(3) == "silent"
+    assert bool(world.state.active[3])
+    np.testing.assert_array_equal(world.position(3), BEACONS[3])
+    world.run(53.0, (1, 2))
+    assert world.keeper.status(3) == "silent"
+    world.run(4.0, (1, 2))
+    assert world.keeper.status(3) == "dropped"
+    np.testing.assert_array_equal(world.state.active, [True, True, True, False])
+    assert [text for _, slot, text in world.events if slot == 3] == ["fell silent", "dropped: not heard for a minute"]
+    assert {slot for _, slot, _ in world.events} == {3}
+
+
+def test_a_silent_beacon_that_is_heard_again_is_static():
+    world = World(known(1, 2, 3))
+    world.run(6.0, (1, 2))
+    world.run(2.0, (1, 2, 3))
+    assert world.keeper.status(3) == "static"
+    assert [text for _, _, text in world.events] == ["fell silent", "is heard again"]
+
+
+def test_a_dropped_beacon_comes_back_the_same_way_as_a_new_one():
+    world = World(known(1, 2, 3))
+    world.run(62.0, (1, 2))
+    assert world.keeper.status(3) == "dropped"
+    world.positions[3] = [3.0, -4.0]
+    world.run(12.0, (1, 2, 3))
+    assert world.keeper.status(3) == "static"
+    np.testing.assert_allclose(world.position(3), [3.0, -4.0], atol=0.15)  # as certain as it must be
+
+
+def test_a_beacon_carried_away_leaves_the_state_and_is_placed_anew():
+    world = World(known(1, 2, 3))
+    world.run(5.0, (1, 2, 3))
+    assert world.events == []
+    world.positions[3] = [2.0, 6.0]
+    world.run(3.0, (1, 2, 3))
+    assert world.keeper.status(3) == "moving"
+    assert not bool(world.state.active[3])
+    world.run(12.0, (1, 2, 3))
+    assert world.keeper.status(3) == "static"
+    np.testing.assert_allclose(world.position(3), [2.0, 6.0], atol=0.15)
+    assert world.keeper.status(1) == world.keeper.status(2) == "static"
+
+
+def test_a_few_wild_ranges_do_not_take_a_beacon_out():
+    world = World(known(1, 2, 3))
+    world.run(3.0, (1, 2, 3))
+    world.excess[3] = 5.0
+    world.run(0.4, (1, 2, 3))
+    world.excess[3] = 0.0
+    world.run(3.0, (1, 2, 3))
+    assert world.events == []
+
+
+@pytest.mark.parametrize("slot", [1, 3])
+def test_taking_a_beacon_out_leaves_a_healthy_covariance(slot):
+    world = World(known(1, 2, 3))
+    others = tuple(s for s in (1, 2, 3) if s != slot)
+    root = np.random.default_rng(0).normal(size=(21, 21)).astype(np.float32)
+    world.state = world.state._replace(belief=world.state.belief._replace(cov=jnp.asarray(root @ root.T)))
+    world.run(62.0, others)
+    P = np.asarray(world.state.belief.cov, float)
+    assert np.linalg.eigvalsh(P)[0] > -1e-5  # float32 of entries of 20
+    np.testing.assert_array_equal(P[2 * slot : 2 * slot + 2, 2 * slot : 2 * slot + 2], np.eye(2))
