@@ -19,6 +19,7 @@ FLOORS: dict[float, str] = {
     2.3: "log_summary",
     3: "objective tiles",
     4: "matching",
+    4.1: "paper",
     5: "slam",
     6: "startup beacons",
     6.1: "history",

@@ -50,7 +50,7 @@ def make_result(frames: int = 200, **changes: Any) -> Result:
             "step_ms_median": 2.345,
             "step_ms_p95": 3.456,
             "real_time_factor": 43.2,
-            "frame_decided_s": 3.2,
+            "decided_at": 3.2,
             "dropped": {"nlos": 137},
             "config": "[uwb]\nsigma_n = 0.125\n",
         },
@@ -212,7 +212,7 @@ def test_an_undecided_run_says_so(tmp_path: Path) -> None:
     assert ">not decided<" in page
     data = data_of(page)
     assert data["map"] is None
-    told = page_of(tmp_path, make_result(summary={"frame_decided_s": None}))
+    told = page_of(tmp_path, make_result(summary={"decided_at": None}))
     assert "The frame was not decided" in told
     assert "The frame was not decided" not in page_of(tmp_path, make_result())
 
@@ -231,7 +231,7 @@ def test_warnings_stand_first(tmp_path: Path) -> None:
         "warnings": ["two radios share id 3"],
         "truncated": "broken after 12.5 s",
         "step_ms_p95": 150.0,
-        "frame_decided_s": 1.0,
+        "decided_at": 1.0,
     }
     page = page_of(tmp_path, make_result(summary=summary))
     top = page[: page.index("<main>")]

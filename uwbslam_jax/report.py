@@ -42,7 +42,7 @@ _FIGURES: dict[str, tuple[str, str, int]] = {
     "beacon_mean_m": ("Beacons, mean", "m", 3),
     "beacon_max_m": ("Beacons, largest", "m", 3),
     "covered": ("Share of the time covered", "", 3),
-    "frame_decided_s": ("Frame decided at", "s", 1),
+    "decided_at": ("Frame decided at", "s", 1),
     "beacons_missing": ("Beacons missing", "", 0),
     "pose_nees": ("Pose NEES", "", 2),
     "pose_nees_ratio": ("Pose NEES / dof", "", 2),
@@ -63,7 +63,7 @@ def write_report(
       title: heading of the page, plain text.
 
     Shown from result.summary besides plain figures: `warnings` (a list of lines), `truncated` (a line or a flag),
-    `dropped` (reason -> count), `config` (TOML text or nested tables), and a key with "decided" in its name, None
+    `dropped` (reason -> count), `config` (TOML text or nested tables), and `decided_at`, None
     where the frame never was.
 
     Raises:
@@ -111,23 +111,23 @@ def _driven(result: Result) -> float:
 
 
 def _decided(result: Result) -> tuple[bool, Any]:
-    """Whether the frame was ever decided, and what the summary tells of when."""
-    told = [value for key, value in result.summary.items() if "decided" in key]
-    return (told[0] is not None and told[0] is not False if told else bool(np.isfinite(result.poses).any())), (
-        told[0] if told else None
-    )
+    """Whether the frame was ever decided, and when [s after the first frame]."""
+    when = result.summary.get("decided_at")
+    return when is not None, when
 
 
 def _notices(result: Result, metrics: Mapping[str, Any] | None) -> Iterator[tuple[str, str]]:
     """What a reader must know before any figure: ("warn" or "info", text)."""
     summary = result.summary
-    if not _decided(result)[0]:
+    if summary.get("status") == "LiDAR only":
+        yield "info", "LiDAR only: poses and map are in the frame that the robot started in."
+    elif not _decided(result)[0]:
         yield (
             "warn",
             "The frame was not decided. Poses, beacons and map are not in a known frame: most often the "
             "robot did not move or turn enough, or too few ranges were heard.",
         )
-    if not result.beacons:
+    elif not result.beacons:
         yield "warn", "No beacon was placed."
     if summary.get("truncated"):
         told = summary["truncated"]

@@ -108,7 +108,9 @@ class Runner:
     def finish(self) -> list[Estimate]:
         """The estimates of what still waits."""
         estimates = [e for frame in self._assembler.flush() for e in self._take(frame)]
-        return estimates + self._step()
+        estimates += self._step()
+        self.session.finish()
+        return estimates
 
     def result(self, facts: Facts) -> Result:
         """The Result so far; odometry, step times and the drops of the frames are added to the facts."""

@@ -112,6 +112,11 @@ class Session:
             self._take(frame, estimate)
         return estimates
 
+    def finish(self) -> None:
+        """The last look, over the frames since the one before."""
+        if self._pending:
+            self._look()
+
     def _learn_slots(self, frame: StampedFrame) -> None:
         if len(frame.slots) > len(self._slots):
             self._slots = dict(frame.slots)
