@@ -1,0 +1,215 @@
+"""A run: nothing is traced again while beacons come and go, online and batch give the same bits."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import small_room as room
+
+from uwbslam_jax import session, slam
+from uwbslam_jax.config import FilterSettings, LidarSettings, MapSettings, Settings, UwbSettings
+from uwbslam_jax.measurements import StampedFrame
+from uwbslam_jax.session import CONTROL_EVERY, TRACES, Session
+
+SETTINGS = Settings(
+    uwb=UwbSettings(max_beacons=3, sigma_n=0.05),
+    lidar=LidarSettings(max_beams=60),
+    map=MapSettings(size_m=12.8, resolution=0.1, levels=2),
+    filter=FilterSettings(beam_share=0.5),  # beams 6 degrees apart share little
+)
+BEACONS = {10: np.array([-3.5, -2.5]), 20: np.array([4.0, -2.0]), 30: np.array([1.0, 3.0])}
+SECOND = 10**9
+
+
+def pose_at(t: float) -> np.ndarray:
+    """Once around an ellipse in 20 s, heading along it; at rest before 0."""
+    a = 2 * np.pi * max(t, 0.0) / 20.0
+    dx, dy = -2.0 * np.sin(a), 1.6 * np.cos(a)
+    return np.array([-1.0 + 2.0 * np.cos(a), 1.6 * np.sin(a), np.arctan2(dy, dx)])
+
+
+class Drive:
+    """Frames of a drive around the room, ten a second, with noise on the ranges."""
+
+    def __init__(self, run: Session, seed: int = 0):
+        self.time, self._config, self._rng = -0.5, run.config, np.random.default_rng(seed)
+        self.slots = {0: 0}
+
+    def frames(self, count: int, heard, dt: float = 0.1, moving: bool = True) -> list[StampedFrame]:
+        made = []
+        for _ in range(count):
+            self.time += dt
+            pose = pose_at(self.time if moving else 0.0)
+            for node in heard:
+                self.slots.setdefault(node, len(self.slots))
+            places = {0: pose[:2], **{self.slots[n]: BEACONS[n] for n in heard}}
+            pairs = [(i, j) for i in places for j in places if i < j]
+            z = [np.hypot(*(places[i] - places[j])) + 0.05 * self._rng.normal() for i, j in pairs]
+            ranges = room.ranges(pairs, z, self._config.max_ranges, age=-0.01)
+            frame = room.frame(self._config, dt, room.scan(pose, self._config.max_beams), ranges)
+            made.append(StampedFrame(round((self.time + 100) * SECOND), frame, dict(self.slots)))
+        return made
+
+
+def leaves(tree) -> list[np.ndarray]:
+    return [np.array(leaf) for leaf in jax.tree.leaves(tree)]
+
+
+def assert_same_bits(a, b) -> None:
+    for x, y in zip(leaves(a), leaves(b), strict=True):
+        assert x.dtype == y.dtype
+        np.testing.assert_array_equal(x, y)
+
+
+@pytest.fixture(scope="module")
+def decided() -> tuple[Session, Drive, dict[str, int]]:
+    """A run that started on two beacons and has decided its frame; and what had been traced after the first looks."""
+    run = Session(SETTINGS)
+    drive = Drive(run)
+    for frame in drive.frames(CONTROL_EVERY, (10, 20)):
+        run.step(frame)
+    run.steps(drive.frames(CONTROL_EVERY, (10, 20)))
+    warm = dict(TRACES)
+    while run.decided_at is None and drive.time < 20.0:
+        for frame in drive.frames(CONTROL_EVERY, (10, 20)):
+            run.step(frame)
+    return run, drive, warm
+
+
+def test_a_drive_around_a_room_is_decided_and_right(decided):
+    run, drive, _ = decided
+    assert run.status == "decided"
+    assert run.hypotheses == 1
+    # published frame: node 10 at the origin, node 20 on +x
+    s = np.asarray(run.state.belief.mean[:6], float).reshape(3, 2)
+    np.testing.assert_allclose(s[1], [0, 0], atol=0.05)
+    np.testing.assert_allclose(s[2], [np.hypot(*(BEACONS[20] - BEACONS[10])), 0], atol=0.05)  # a range's noise
+    axis = BEACONS[20] - BEACONS[10]
+    turn = np.arctan2(axis[1], axis[0])
+    R = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    want = R @ (pose_at(drive.time)[:2] - BEACONS[10])
+    np.testing.assert_allclose(s[0], want, atol=0.15)  # a cell and a half
+    estimate = run.step(drive.frames(1, (10, 20))[0])
+    assert bool(estimate.active[1])
+    while run.room() != CONTROL_EVERY:
+        run.step(drive.frames(1, (10, 20))[0])
+
+
+def test_nothing_is_traced_again_while_beacons_join_fall_silent_and_drop(decided):
+    run, drive, warm = decided
+    assert run.decided_at is not None
+    while run.room() != CONTROL_EVERY:
+        run.step(drive.frames(1, (10, 20))[0])
+    for _ in range(12):  # a third one is heard: it joins
+        run.steps(drive.frames(CONTROL_EVERY, (10, 20, 30)))
+    slot = run.slots[30]
+    assert run.beacon_status(slot) == "static"
+    assert bool(run.state.active[slot])
+    # it falls silent for more than a minute, the robot at rest: it is dropped
+    drive.time = 20.0 * np.ceil(drive.time / 20.0)
+    for _ in range(8):
+        for frame in drive.frames(CONTROL_EVERY, (10, 20), dt=1.0, moving=False):
+            run.step(frame)
+    assert run.beacon_status(slot) == "dropped"
+    assert not bool(run.state.active[slot])
+    # a mask changed from outside, and the map's window moved
+    run.state = run.state._replace(active=run.state.active.at[2].set(False))
+    grid = run.tiles.recentre(run.state.grid, np.array([7.0, 0.0]))
+    run.state = run.state._replace(grid=run.tiles.recentre(grid, np.zeros(2)))
+    run.steps(drive.frames(CONTROL_EVERY, (10, 20), moving=False))
+    for frame in drive.frames(CONTROL_EVERY, (10, 20, 30), moving=False):
+        run.step(frame)
+    assert set(warm) >= {"step_once", "step_many"}
+    assert dict(TRACES) == warm
+
+
+def test_online_and_batch_give_the_same_bits():
+    online, batch = Session(SETTINGS), Session(SETTINGS)
+    frames = Drive(online).frames(4 * CONTROL_EVERY, (10, 20, 30))
+    one_by_one = [online.step(frame) for frame in frames]
+    chunked = [e for k in range(4) for e in batch.steps(frames[CONTROL_EVERY * k : CONTROL_EVERY * (k + 1)])]
+    for a, b in zip(one_by_one, chunked, strict=True):
+        assert_same_bits(a, b)
+    assert_same_bits(online.state, batch.state)
+    np.testing.assert_array_equal(online.history.poses, batch.history.poses)
+    assert online.history.events == batch.history.events
+    assert online.status == batch.status
+
+
+def test_compiled_steps_give_the_same_bits_with_beacons_in_the_state():
+    """Every part of the step at work: ranges that count, matches, drawing, frames without a scan."""
+    run = Session(SETTINGS)
+    frames = [f.frame for f in Drive(run).frames(12, (10, 20, 30))]
+    frames[5] = room.frame(run.config, 0.1, None, frames[5].ranges)
+
+    def start():
+        state = slam.init(run.config)
+        first = pose_at(0.0)
+        c, s = np.cos(first[2]), np.sin(first[2])
+        seen = np.array([(b - first[:2]) @ np.array([[c, -s], [s, c]]) for b in BEACONS.values()])
+        mean = state.belief.mean.at[2:8].set(jnp.asarray(seen.ravel(), jnp.float32))
+        cov = state.belief.cov.at[jnp.arange(2, 8), jnp.arange(2, 8)].set(0.01)
+        return state._replace(belief=state.belief._replace(mean=mean, cov=cov), active=jnp.ones(4, bool))
+
+    state, estimates = start(), []
+    for frame in frames:
+        state, estimate = session.step_once(run.config, run.params, state, frame)
+        estimates.append(jax.device_get(estimate))
+    stacked = jax.tree.map(lambda *x: np.stack(x), *frames)
+    # in chunks of the length that is compiled already, and of another
+    other, many = session.step_many(run.config, run.params, start(), stacked)
+    assert_same_bits(state, other)
+    assert_same_bits(jax.tree.map(lambda *x: np.stack(x), *estimates), many)
+    assert float(np.max(many.weight)) > 0
+    assert bool(np.any(many.drawn))
+
+
+def test_fewer_frames_than_a_chunk_are_stepped_one_by_one():
+    run, other = Session(SETTINGS), Session(SETTINGS)
+    frames = Drive(run).frames(3, (10,))
+    got = run.steps(frames)
+    assert run.room() == CONTROL_EVERY - 3
+    for a, b in zip(got, [other.step(f) for f in frames], strict=True):
+        assert_same_bits(a, b)
+
+
+def test_at_rest_the_status_says_that_it_waits_for_motion():
+    run = Session(SETTINGS)
+    for _ in range(3):
+        run.steps(Drive(run).frames(CONTROL_EVERY, (10, 20, 30), moving=False))
+    assert run.status == "waiting for motion"
+    assert run.decided_at is None
+    np.testing.assert_array_equal(run.state.active, [True, False, False, False])
+
+
+def test_biases_and_heights_follow_the_ids_as_they_are_heard():
+    settings = Settings(
+        uwb=UwbSettings(max_beacons=3, bias={"20": 0.2}, height={"10": 1.5}),
+        lidar=SETTINGS.lidar,
+        map=SETTINGS.map,
+    )
+    run = Session(settings)
+    drive = Drive(run)
+    np.testing.assert_array_equal(run.params.bias, 0.0)
+    run.step(drive.frames(1, (20,))[0])
+    np.testing.assert_allclose(run.params.bias, [0, 0.2, 0, 0])
+    run.step(drive.frames(1, (20, 10))[0])
+    np.testing.assert_allclose(run.params.height, [0, 0, 1.5, 0])
+    assert run.slots == {0: 0, 20: 1, 10: 2}
+
+
+def test_lidar_only_needs_no_beacon():
+    settings = Settings(
+        uwb=SETTINGS.uwb, lidar=SETTINGS.lidar, map=SETTINGS.map, filter=FilterSettings(lidar_only=True)
+    )
+    run = Session(settings)
+    drive = Drive(run)
+    for _ in range(4):
+        last = run.steps(drive.frames(CONTROL_EVERY, (10, 20, 30)))[-1]
+    assert run.status == "LiDAR only"
+    first = pose_at(0.0)
+    c, s = np.cos(first[2]), np.sin(first[2])
+    want = (pose_at(drive.time)[:2] - first[:2]) @ np.array([[c, -s], [s, c]])
+    np.testing.assert_allclose(last.pose[:2], want, atol=0.1)  # a cell
