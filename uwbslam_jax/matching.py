@@ -12,12 +12,17 @@ from jaxtyping import Array, Bool, Float
 
 from uwbslam_jax import grid as occupancy
 from uwbslam_jax.ekf import Gaussian, symmetric_root
-from uwbslam_jax.geometry import transform_points, wrap_angle
+from uwbslam_jax.geometry import rotation, safe_norm, transform_points, wrap_angle
 from uwbslam_jax.grid import Grid, Sweep
 from uwbslam_jax.objective import lidar_gram, lidar_residual, prior_residual
 
 _MOVES = (6, 5, 5)
 """Gauss-Newton moves at the finest, middle and every coarser level."""
+_NEIGHBOURS = (1, 2, 4, 8, 16)
+_NORMAL_SPAN = (0.25, 1.0)
+"""A normal needs neighbours this far apart [m]."""
+_BLIND = (0.006, 0.02)
+"""Share of normals in the least seen direction below which a scan is blind in it, and above which it is not."""
 _SEARCH_HEADINGS = 120
 _SEARCH_BEAMS = 180
 _SEARCH_REFINED = 8
@@ -39,6 +44,50 @@ class Match(NamedTuple):
     known: Float[Array, ""]
 
 
+class Blind(NamedTuple):
+    """The direction in which a scan cannot tell where it is: along a corridor whose ends are out of reach.
+
+    Attributes:
+      direction: (2,) unit vector in the robot's frame.
+      weight: 0 where the scan sees enough in every direction, 1 where it sees nothing in this one.
+    """
+
+    direction: Float[Array, "2"]
+    weight: Float[Array, ""]
+
+
+def blind_direction(sweep: Sweep) -> Blind:
+    """From the scan alone: the least eigenvector of the mean n n^T of its surface normals (DESIGN 1.8).
+
+    The map cannot tell. The cells of a straight wall form a pattern along it, to which a scan locks: HectorSLAM
+    shortens corridors. A normal comes from the two neighbours of a beam that are far enough apart for range noise not
+    to matter; where the three are not on one line there is no surface, and no normal.
+    """
+    points, valid = sweep.points, sweep.valid
+    tangent = jnp.zeros_like(points)
+    found = jnp.zeros_like(valid)
+    for k in _NEIGHBOURS:
+        before, after = jnp.roll(points, k, axis=0), jnp.roll(points, -k, axis=0)
+        t = after - before
+        span = safe_norm(t)
+        index = jnp.arange(points.shape[0])
+        ok = valid & jnp.roll(valid, k) & jnp.roll(valid, -k) & (index >= k) & (index < points.shape[0] - k)
+        bend = safe_norm(after + before - 2 * points)
+        ok = ok & (span > _NORMAL_SPAN[0]) & (span < _NORMAL_SPAN[1]) & (bend < 0.05 + 0.1 * span) & ~found
+        tangent = jnp.where(ok[:, None], t / jnp.maximum(span, 1e-6)[:, None], tangent)
+        found = found | ok
+    T = tangent.T @ tangent  # of tangents: its largest eigenvector is where the walls run
+    share, directions = jnp.linalg.eigh(T / jnp.maximum(jnp.sum(found), 1))
+    weight = jnp.clip((_BLIND[1] - share[0]) / (_BLIND[1] - _BLIND[0]), 0.0, 1.0)
+    return Blind(directions[:, 1], jnp.where(jnp.sum(found) > 20, weight, 0.0))
+
+
+def seen(blind: Blind, heading: Float[Array, ""]) -> Float[Array, "2 2"]:
+    """Projector on what the scan sees, in the frame of a heading."""
+    e = rotation(heading) @ blind.direction
+    return jnp.eye(2) - blind.weight * e[:, None] * e[None, :]
+
+
 class _LidarAndPrior(NamedTuple):
     """What the residual of a match needs, at one level."""
 
@@ -50,10 +99,13 @@ class _LidarAndPrior(NamedTuple):
     mean: Float[Array, "3"]
     root: Float[Array, "3 3"]
     sigma_l: Float[Array, ""]
+    seen: Float[Array, "2 2"]
 
 
 def _residual(pose: Float[Array, "3"], a: _LidarAndPrior) -> Float[Array, "7"]:
-    lidar = lidar_residual(pose, a.level, a.origin, a.size, a.points, a.valid) / a.sigma_l
+    # what the scan cannot see is left to the prior: the LiDAR block does not depend on it
+    held = a.mean[:2] + a.seen @ (pose[:2] - a.mean[:2])
+    lidar = lidar_residual(jnp.append(held, pose[2]), a.level, a.origin, a.size, a.points, a.valid) / a.sigma_l
     return jnp.concatenate([lidar, prior_residual(pose, a.mean, a.root)])
 
 
@@ -67,20 +119,28 @@ def gauss_newton(residual, start, args, moves: int):
 
 
 def align(
-    grid: Grid, sweep: Sweep, start: Float[Array, "3"], prior: Gaussian, sigma_l: Float[Array, ""], resolution: float
+    grid: Grid,
+    sweep: Sweep,
+    blind: Blind,
+    start: Float[Array, "3"],
+    prior: Gaussian,
+    sigma_l: Float[Array, ""],
+    resolution: float,
 ) -> Float[Array, "3"]:
     """Pose that minimises 1/2 sum (1 - Gamma)^2 / sigma_l^2 + the prior's quadratic, coarse to fine (DESIGN 1.4)."""
     root = jnp.linalg.inv(symmetric_root(prior.cov))
+    projector = seen(blind, start[2])
     pose = start
     for k in reversed(range(len(grid.levels))):
         size = jnp.asarray(resolution * 2**k, pose.dtype)
-        args = _LidarAndPrior(grid.levels[k], grid.origin, size, sweep.points, sweep.valid, prior.mean, root, sigma_l)
+        scan = (grid.levels[k], grid.origin, size, sweep.points, sweep.valid)
+        args = _LidarAndPrior(*scan, prior.mean, root, sigma_l, projector)
         pose = gauss_newton(_residual, pose, args, _MOVES[min(k, 2)])
     return pose
 
 
-def assess(grid: Grid, sweep: Sweep, pose: Float[Array, "3"], resolution: float) -> Match:
-    """Score and information of a pose against the finest level."""
+def assess(grid: Grid, sweep: Sweep, blind: Blind, pose: Float[Array, "3"], resolution: float) -> Match:
+    """Score and information of a pose against the finest level; no information where the scan is blind."""
     level, origin = grid.levels[0], grid.origin
     gram = lidar_gram(pose, level, origin, resolution, sweep.points, sweep.valid)
     ends = transform_points(pose, sweep.points)
@@ -89,12 +149,14 @@ def assess(grid: Grid, sweep: Sweep, pose: Float[Array, "3"], resolution: float)
     observed = sweep.valid & inside & jnp.any(corners != 0, axis=(1, 2))
     count = jnp.sum(observed)
     score = jnp.sum(jnp.where(observed, value, 0.0)) / jnp.maximum(count, 1)
-    return Match(pose, gram[:3, :3], score, count / jnp.maximum(jnp.sum(sweep.valid), 1))
+    projector = jnp.eye(3).at[:2, :2].set(seen(blind, pose[2]))
+    return Match(pose, projector @ gram[:3, :3] @ projector, score, count / jnp.maximum(jnp.sum(sweep.valid), 1))
 
 
 def search(
     grid: Grid,
     sweep: Sweep,
+    blind: Blind,
     prior: Gaussian,
     sigma_l: Float[Array, ""],
     resolution: float,
@@ -128,8 +190,8 @@ def search(
 
     def refine(start):
         wide = Gaussian(start, prior.cov * 0 + jnp.diag(jnp.array([0.3, 0.3, 0.3]) ** 2))
-        pose = align(grid, sweep, start, wide, sigma_l, resolution)
-        m = assess(grid, sweep, pose, resolution)
+        pose = align(grid, sweep, blind, start, wide, sigma_l, resolution)
+        m = assess(grid, sweep, blind, pose, resolution)
         return pose, (m.score - 0.5) * m.known
 
     poses, values = jax.lax.map(refine, starts)

@@ -185,7 +185,9 @@ def _joint_match(config, params, state, belief, frame, sweep, usable) -> tuple[G
         offset = paper.joint_match(state.grid, sweep, belief, frame.ranges, usable, free, params, config.resolution)
         offset = jnp.where(frame.has_scan, offset, 0.0)
     corrected = paper.correct(belief, offset)
-    match = matching.assess(state.grid, sweep, layout.robot_pose(corrected.mean), config.resolution)
+    blind = matching.Blind(jnp.zeros(2), jnp.zeros(()))  # the paper takes every match for what its Hessian says
+    pose = layout.robot_pose(corrected.mean)
+    match = matching.assess(state.grid, sweep, blind, pose, config.resolution)
     no = jnp.zeros((), bool)
     matched = _Matched(match, jnp.zeros((3, 3)), no, no, frame.has_scan)
     return corrected if config.correction else belief, matched
@@ -215,13 +217,14 @@ def _match(config, params, state, belief, sweep, has_scan) -> tuple[Match, Bool[
     C = layout.matched_pose_jacobian(config.nodes)
     prior = Gaussian(C @ belief.mean, C @ belief.cov @ C.T + jnp.diag(jnp.array(_ALIGN_FLOOR) ** 2))
     start = prior.mean
-    pose = matching.align(state.grid, sweep, start, prior, params.sigma_l, config.resolution)
-    match = matching.assess(state.grid, sweep, pose, config.resolution)
+    blind = matching.blind_direction(sweep)
+    pose = matching.align(state.grid, sweep, blind, start, prior, params.sigma_l, config.resolution)
+    match = matching.assess(state.grid, sweep, blind, pose, config.resolution)
     wanted = has_scan & (match.known > _KNOWN_ENOUGH) & (match.score < _POOR_SCORE)
 
     def wide(_):
-        found = matching.search(state.grid, sweep, prior, params.sigma_l, config.resolution)
-        other = matching.assess(state.grid, sweep, found, config.resolution)
+        found = matching.search(state.grid, sweep, blind, prior, params.sigma_l, config.resolution)
+        other = matching.assess(state.grid, sweep, blind, found, config.resolution)
         better = (other.score - 0.5) * other.known > (match.score - 0.5) * match.known + 0.02
         return jax.tree.map(lambda a, b: jnp.where(better, a, b), other, match)
 
