@@ -128,7 +128,7 @@ def test_one_move_without_ranges_and_prior_is_hectorslams(case):
     pose, level, origin, points, valid = case
     # a prior too wide to matter
     args = matching._LidarAndPrior(
-        level, origin, jnp.array(SIZE), points, valid, pose, 1e-9 * jnp.eye(3), jnp.array(1.0)
+        level, origin, jnp.array(SIZE), points, valid, pose, 1e-9 * jnp.eye(3), jnp.array(1.0), jnp.eye(2)
     )
     moved = matching.gauss_newton(matching._residual, pose, args, 1)
     slope = -jax.jacfwd(residuals)(pose, level, origin, points, valid)  # gradient of Gamma
@@ -142,7 +142,7 @@ def test_one_move_without_ranges_and_prior_is_hectorslams(case):
 def test_one_move_with_a_prior_solves_the_normal_equations(case):
     pose, level, origin, points, valid = case
     root, mean, sigma_l = 5.0 * jnp.eye(3), double(pose + jnp.array([0.05, -0.02, 0.01])), jnp.array(0.25)
-    args = matching._LidarAndPrior(level, origin, jnp.array(SIZE), points, valid, mean, root, sigma_l)
+    args = matching._LidarAndPrior(level, origin, jnp.array(SIZE), points, valid, mean, root, sigma_l, jnp.eye(2))
     moved = matching.gauss_newton(matching._residual, pose, args, 1)
     slope = -jax.jacfwd(residuals)(pose, level, origin, points, valid) / sigma_l
     r = residuals(pose, level, origin, points, valid) / sigma_l

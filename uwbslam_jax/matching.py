@@ -63,7 +63,8 @@ def blind_direction(sweep: Sweep) -> Blind:
     shortens corridors. A normal comes from the two neighbours of a beam that are far enough apart for range noise not
     to matter; where the three are not on one line there is no surface, and no normal.
     """
-    points, valid = sweep.points, sweep.valid
+    # what is seen is a decision, held when the step is differentiated
+    points, valid = jax.lax.stop_gradient(sweep.points), sweep.valid
     tangent = jnp.zeros_like(points)
     found = jnp.zeros_like(valid)
     for k in _NEIGHBOURS:
