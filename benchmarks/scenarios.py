@@ -22,7 +22,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import NamedTuple
 
-from uwbslam_jax.__main__ import keep_compiled
+from uwbslam_jax.__main__ import prepare
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -195,7 +195,7 @@ def run_scenario(name: str, seeds: int, workers: int, duration: float | None) ->
 
 def main() -> int:
     """Returns 0, or 1 where a bar is missed."""
-    keep_compiled()  # before JAX is imported, which reads it once
+    prepare()  # before JAX is imported, which reads it once
     from uwbslam_jax.simulate import SCENARIOS
 
     parser = argparse.ArgumentParser(prog="python -m benchmarks.scenarios", description=__doc__)

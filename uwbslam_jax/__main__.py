@@ -40,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         hint = f", did you mean {near[0]}?" if near else f"; there are {', '.join(COMMANDS)}"
         return _fail(f"no command {words[0]}{hint}")
     try:
-        keep_compiled()
+        prepare()
         from uwbslam_jax import commands
 
         return _guarded(commands, words)
@@ -68,11 +68,16 @@ def _fail(text: str) -> int:
     return BAD_INPUT
 
 
-def keep_compiled() -> None:
-    """Compiled programs are kept in the user's cache folder: the second run starts in seconds."""
+def prepare() -> None:
+    """Settings of the process that the libraries read once, before they are imported.
+
+    Compiled programs are kept in the user's cache folder: the second run starts in seconds. LAPACK works alone: its
+    threads spin over matrices of 40 rows and make a step many times slower than one thread does.
+    """
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "uwbslam_jax" / "jax"
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def usage() -> str:
