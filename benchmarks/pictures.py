@@ -1,6 +1,6 @@
 """Pictures of finished runs for the README: map, track and beacons of a run directory.
 
-    python -m benchmarks.pictures RUN_DIR -o docs/images/NAME.png
+python -m benchmarks.pictures RUN_DIR -o docs/images/NAME.png
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import numpy as np
 from uwbslam_jax.outputs import read_run
 
 
-def read_map(directory: Path) -> tuple[np.ndarray, list[float]]:
-    """Grey values (rows, cols), row 0 the largest y, and extent [x0, x1, y0, y1] [m] of a map_server map."""
+def read_map(directory: Path) -> tuple[np.ndarray, tuple[float, float, float, float]]:
+    """Grey values (rows, cols), row 0 the largest y, and extent (x0, x1, y0, y1) [m] of a map_server map."""
     lines = dict(line.split(": ", 1) for line in (directory / "map.yaml").read_text().splitlines() if ": " in line)
     x0, y0, _ = (float(v) for v in lines["origin"].strip("[] ").split(","))
     resolution = float(lines["resolution"])
@@ -23,7 +23,7 @@ def read_map(directory: Path) -> tuple[np.ndarray, list[float]]:
     header, _, rest = data.partition(b"255\n")
     cols, rows = (int(v) for v in header.split()[-2:])
     grey = np.frombuffer(rest, np.uint8, rows * cols).reshape(rows, cols)
-    return grey, [x0, x0 + cols * resolution, y0, y0 + rows * resolution]
+    return grey, (x0, x0 + cols * resolution, y0, y0 + rows * resolution)
 
 
 def draw(directory: Path, out: Path, title: str) -> None:

@@ -1,6 +1,6 @@
 """Puts the generated result tables into the README, between its two marks.
 
-    python -m benchmarks.readme
+python -m benchmarks.readme
 """
 
 from __future__ import annotations

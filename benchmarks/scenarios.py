@@ -74,9 +74,9 @@ class Row:
 def measure(name: str, seed: int, duration: float | None) -> Row:
     """Simulates one seed, runs it and compares."""
     # here, not above: a worker process sets up JAX on its own
-    from uwbslam_jax.config import from_dict
     from uwbslam_jax.metrics import evaluate
     from uwbslam_jax.run import run_messages
+    from uwbslam_jax.settings_file import from_dict
     from uwbslam_jax.simulate import scenario, settings_overrides, simulate
 
     made = scenario(name, seed, duration)

@@ -36,6 +36,11 @@ def difference(function: Callable[[Any], jax.Array], at: Any, direction: Any, st
     return (np.asarray(ahead) - np.asarray(behind)) / (2 * step)
 
 
+def value_and_gradient(function: Callable[..., jax.Array]) -> Callable[..., Any]:
+    """Both in one compilation, the larger part of what a derivative test costs; so the compiler is not to optimise."""
+    return jax.jit(jax.value_and_grad(function), compiler_options={"xla_backend_optimization_level": 0})
+
+
 def assert_gradient(
     function: Callable[[Any], jax.Array],
     at: Any,
@@ -50,16 +55,31 @@ def assert_gradient(
 
     The default tolerances are those of a central difference in float64 with some room. Returns the gradient.
     """
-    function = jax.jit(function)
-    gradient = jax.jit(jax.grad(function))(at)
+    both = value_and_gradient(function)
+    gradient = assert_reverse(both, at, rtol=rtol, atol=atol, count=count, step=step)
+    if forward:
+        pushed = jax.jit(lambda d: jax.jvp(function, (at,), (d,))[1])
+        for direction in directions(at, count):
+            # the same derivative by two orders of summation: rounding only
+            np.testing.assert_allclose(pushed(direction), along(gradient, direction), rtol=1e-9, atol=1e-10)
+    return gradient
+
+
+def assert_reverse(both, at: Any, *rest: Any, rtol: float, atol: float, count: int = 6, step: float = STEP) -> Any:
+    """Reverse mode and central differences agree along random directions of the first argument; returns the gradient.
+
+    Args:
+      both: of `value_and_gradient`.
+    """
+    gradient = both(at, *rest)[1]
     for leaf in jax.tree.leaves(gradient):
         assert np.isfinite(leaf).all()
-    pushed = jax.jit(lambda d: jax.jvp(function, (at,), (d,))[1])
     for direction in directions(at, count):
-        products = jax.tree.map(lambda g, d: float(jnp.sum(g * d)), gradient, direction)
-        reverse = sum(jax.tree.leaves(products))
-        np.testing.assert_allclose(reverse, difference(function, at, direction, step), rtol=rtol, atol=atol)
-        if forward:
-            # the same derivative by two orders of summation: rounding only
-            np.testing.assert_allclose(float(pushed(direction)), reverse, rtol=1e-9, atol=1e-10)
+        numeric = difference(lambda x: both(x, *rest)[0], at, direction, step)
+        np.testing.assert_allclose(along(gradient, direction), numeric, rtol=rtol, atol=atol)
     return gradient
+
+
+def along(gradient: Any, direction: Any) -> float:
+    """Derivative along a direction."""
+    return sum(jax.tree.leaves(jax.tree.map(lambda g, d: float(jnp.sum(g * d)), gradient, direction)))

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from uwbslam_jax import commands, config
+from uwbslam_jax import commands, settings_file
 from uwbslam_jax.__main__ import COMMANDS, main
 from uwbslam_jax.config import Settings
 from uwbslam_jax.mcap_log import LogReader, LogWriter
@@ -229,7 +229,7 @@ class TestSimulate:
         path = tmp_path / "made.mcap"
         assert main(["simulate", "lever_arms", "--seed", "3", "--duration", "1", "-o", str(path), "--quiet"]) == 0
         made = scenario("lever_arms", 3, 1.0)
-        assert config.load(path.with_suffix(".toml")) == config.from_dict(settings_overrides(made))
+        assert settings_file.load(path.with_suffix(".toml")) == settings_file.from_dict(settings_overrides(made))
         assert sum(isinstance(m, ScanMessage) for m in LogReader(path)) == 10
 
     def test_defaults_need_none(self, tmp_path: Path) -> None:

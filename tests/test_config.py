@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uwbslam_jax import config
+from uwbslam_jax import config, settings_file
 from uwbslam_jax.config import ConfigError, Settings
 
 positive = st.floats(1e-6, 1e6)
@@ -40,13 +40,13 @@ settings_strategy = st.builds(
 
 @given(settings_strategy)
 def test_dump_reads_back_to_the_same_settings(settings: Settings) -> None:
-    assert config.from_dict(tomllib.loads(config.dump(settings))) == settings
+    assert settings_file.from_dict(tomllib.loads(settings_file.dump(settings))) == settings
 
 
 def test_defaults_are_valid_and_round_trip_through_a_file(tmp_path: Path) -> None:
     path = tmp_path / "a.toml"
-    path.write_text(config.dump(Settings()), encoding="utf-8")
-    assert config.load(path) == config.check(Settings()) == config.from_dict({})
+    path.write_text(settings_file.dump(Settings()), encoding="utf-8")
+    assert settings_file.load(path) == settings_file.check(Settings()) == settings_file.from_dict({})
 
 
 def test_the_design_example_loads(tmp_path: Path) -> None:
@@ -55,7 +55,7 @@ def test_the_design_example_loads(tmp_path: Path) -> None:
         "[robot]\nid = 0\nantenna = [0.16, 0, 1.12]\nlidar = [0.095, 0.0, 0.0]\n[uwb]\nsigma_n = 1\n"
         'height = {"1" = 1.94}\nbias = {"1" = 0.12}\n'
     )
-    settings = config.load(str(path))
+    settings = settings_file.load(str(path))
     assert settings.robot.antenna == (0.16, 0.0, 1.12)
     assert settings.uwb.sigma_n == 1.0
     assert type(settings.uwb.sigma_n) is float
@@ -97,14 +97,14 @@ def test_the_design_example_loads(tmp_path: Path) -> None:
 )
 def test_errors_say_what_is_wrong_in_one_line(table: dict, message: str) -> None:
     with pytest.raises(ConfigError) as error:
-        config.from_dict(table)
+        settings_file.from_dict(table)
     assert str(error.value) == message
 
 
 def test_every_unknown_key_names_a_known_one() -> None:
     for section in dataclasses.fields(Settings):
         with pytest.raises(ConfigError, match=rf"did you mean {section.name}\.\w+\?"):
-            config.from_dict({section.name: {"zzzzzz": 1}})
+            settings_file.from_dict({section.name: {"zzzzzz": 1}})
 
 
 @pytest.mark.parametrize(
@@ -118,6 +118,6 @@ def test_an_unreadable_file_is_a_config_error_that_names_it(
     if content is not None:
         path.write_bytes(content)
     with pytest.raises(ConfigError, match=message) as error:
-        config.load(path)
+        settings_file.load(path)
     assert str(path) in str(error.value)
     assert "\n" not in str(error.value)

@@ -35,7 +35,6 @@ def search(grid, sweep, prior, sigma_l, resolution):
     return matching.search(grid, sweep, matching.blind_direction(sweep), prior, sigma_l, resolution)
 
 
-
 def sweep_at(pose, beams=BEAMS, walls=room.WALLS):
     scan = jax.tree.map(jnp.asarray, room.scan(np.array(pose, float), beams, walls))
     return undo_motion(scan, jnp.zeros(3), jnp.zeros(2), jnp.zeros(()))
@@ -156,7 +155,8 @@ def test_a_problem_that_cannot_be_solved_does_not_raise():
 @pytest.mark.usefixtures("x64")
 def test_gradient_of_an_alignment_agrees_with_finite_differences(room_map):
     """Through all moves of all levels, as many as are made: by prior, start, map and sigma_l (reverse mode only)."""
-    grid, sweep = double(room_map), double(sweep_at((0.33, -0.41, 0.6), 60))
+    grid = double(room_map._replace(levels=room_map.levels[:2]))
+    sweep = double(sweep_at((0.33, -0.41, 0.6), 60))
     weights = jnp.array([1.0, -2.0, 0.5])
 
     def value(at):
@@ -167,6 +167,4 @@ def test_gradient_of_an_alignment_agrees_with_finite_differences(room_map):
 
     truth = jnp.array([0.33, -0.41, 0.6])
     at = (truth + 0.05, truth + jnp.array([0.06, -0.03, 0.02]), grid.levels[0], jnp.array(SIGMA_L))
-    assert_gradient(value, at, rtol=1e-4, atol=1e-7, step=1e-7, forward=False)
-
-
+    assert_gradient(value, at, rtol=1e-4, atol=1e-7, step=1e-7, forward=False, count=4)

@@ -30,23 +30,28 @@ def case():
     return tuple(jnp.asarray(x) for x in (pose, smooth, origin, points, valid))
 
 
+@jax.jit
 def residuals(pose, level, origin, points, valid):
     """1 - Gamma of each beam by itself, 0 where it did not return: the first term of eq. (opt)."""
     window = occupancy.Grid((level,), origin)
     return jnp.where(valid, 1.0 - occupancy.lookup(window, transform_points(pose, points), SIZE), 0.0)
 
 
+@jax.jit
 def lidar(pose, level, origin, points, valid):
     return objective.lidar_residual(pose, level, origin, SIZE, points, valid)
+
+
+residual_jacobian, lidar_jacobian = jax.jit(jax.jacfwd(residuals)), jax.jit(jax.jacfwd(lidar))
 
 
 @pytest.mark.usefixtures("x64")
 def test_gram_matrix_holds_the_papers_sums(case):
     pose, *rest = case
     r = residuals(pose, *rest)
-    J = jax.jacfwd(residuals)(pose, *rest)
+    J = residual_jacobian(pose, *rest)
     level, origin, points, valid = rest
-    G = objective.lidar_gram(pose, level, origin, SIZE, points, valid)
+    G = jax.jit(objective.lidar_gram)(pose, level, origin, SIZE, points, valid)
     # H^(LiD), -M^(LiD) and twice the LiDAR term; float64
     np.testing.assert_allclose(G[:3, :3], J.T @ J, rtol=1e-10)
     np.testing.assert_allclose(G[:3, 3], J.T @ r, rtol=1e-10, atol=1e-10)
@@ -56,8 +61,8 @@ def test_gram_matrix_holds_the_papers_sums(case):
 @pytest.mark.usefixtures("x64")
 def test_four_rows_stand_for_all_beams_in_value_gradient_and_normal_equations(case):
     pose, *rest = case
-    r, J = residuals(pose, *rest), jax.jacfwd(residuals)(pose, *rest)
-    short, short_J = lidar(pose, *rest), jax.jacfwd(lidar)(pose, *rest)
+    r, J = residuals(pose, *rest), residual_jacobian(pose, *rest)
+    short, short_J = lidar(pose, *rest), lidar_jacobian(pose, *rest)
     assert short.shape == (4,)
     np.testing.assert_allclose(short @ short, r @ r, rtol=JITTER)
     np.testing.assert_allclose(short_J.T @ short, J.T @ r, rtol=1e-9, atol=1e-9)
@@ -71,7 +76,7 @@ def test_gradient_of_the_lidar_term_agrees_with_finite_differences(case):
     gradient = assert_gradient(
         lambda x: 0.5 * jnp.sum(lidar(x[0], x[1], x[2], x[3], valid) ** 2), tuple(at[:3] + at[3:]), rtol=1e-5
     )
-    direct = jax.grad(lambda x: 0.5 * jnp.sum(residuals(*x, valid) ** 2))(tuple(at))
+    direct = jax.jit(jax.grad(lambda x: 0.5 * jnp.sum(residuals(*x, valid) ** 2)))(tuple(at))
     for got, want in zip(gradient, direct, strict=True):
         np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-8)
     np.testing.assert_array_equal(gradient[3][~np.asarray(valid)], 0.0)
@@ -113,10 +118,8 @@ def test_nothing_to_match_is_finite_in_value_and_gradient(case, what):
         level = jnp.zeros_like(level)
     else:
         origin = origin + 1000.0
-    J = jax.jacfwd(lidar)(pose, level, origin, points, valid)
-    gradient = jax.grad(lambda x: jnp.sum(lidar(x[0], x[1], origin, x[2], valid) ** 2), allow_int=False)(
-        (pose, level, points)
-    )
+    J = lidar_jacobian(pose, level, origin, points, valid)
+    gradient = jax.jit(jax.grad(lambda x: jnp.sum(lidar(x[0], x[1], origin, x[2], valid) ** 2)))((pose, level, points))
     assert np.isfinite(J).all()
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
     np.testing.assert_allclose(gradient[0], 0.0, atol=1e-6)
@@ -131,7 +134,7 @@ def test_one_move_without_ranges_and_prior_is_hectorslams(case):
         level, origin, jnp.array(SIZE), points, valid, pose, 1e-9 * jnp.eye(3), jnp.array(1.0), jnp.eye(2)
     )
     moved = matching.gauss_newton(matching._residual, pose, args, 1)
-    slope = -jax.jacfwd(residuals)(pose, level, origin, points, valid)  # gradient of Gamma
+    slope = -residual_jacobian(pose, level, origin, points, valid)  # gradient of Gamma
     H = slope.T @ slope
     M = slope.T @ residuals(pose, level, origin, points, valid)
     step = np.linalg.solve(H, M)
@@ -144,7 +147,7 @@ def test_one_move_with_a_prior_solves_the_normal_equations(case):
     root, mean, sigma_l = 5.0 * jnp.eye(3), double(pose + jnp.array([0.05, -0.02, 0.01])), jnp.array(0.25)
     args = matching._LidarAndPrior(level, origin, jnp.array(SIZE), points, valid, mean, root, sigma_l, jnp.eye(2))
     moved = matching.gauss_newton(matching._residual, pose, args, 1)
-    slope = -jax.jacfwd(residuals)(pose, level, origin, points, valid) / sigma_l
+    slope = -residual_jacobian(pose, level, origin, points, valid) / sigma_l
     r = residuals(pose, level, origin, points, valid) / sigma_l
     step = np.linalg.solve(slope.T @ slope + root.T @ root, slope.T @ r - root.T @ root @ (pose - mean))
     np.testing.assert_allclose(moved - pose, step, rtol=1e-4, atol=1e-7)

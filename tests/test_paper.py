@@ -41,7 +41,7 @@ def joint() -> paper._Joint:
     params = make_params(Settings(uwb=UwbSettings(max_beacons=NODES - 1)))._replace(gamma=jnp.array(GAMMA))
     arrays = 0.3 * rng.normal(size=(40, 40)), np.full(2, -4.0), np.array(0.2), rng.uniform(-2.5, 2.5, (60, 2))
     level, origin, size, points = (jnp.asarray(x) for x in arrays)
-    ranges = double(measured) if jax.config.jax_enable_x64 else jax.tree.map(jnp.asarray, measured)
+    ranges = double(measured) if jax.config.read("jax_enable_x64") else jax.tree.map(jnp.asarray, measured)
     return paper._Joint(
         level=level,
         origin=origin,
@@ -52,7 +52,7 @@ def joint() -> paper._Joint:
         ranges=ranges,
         usable=ranges.valid,
         free=paper.free_coordinates(jnp.ones(NODES, bool), FRAME).astype(points.dtype),
-        params=double(params) if jax.config.jax_enable_x64 else params,
+        params=double(params) if jax.config.read("jax_enable_x64") else params,
     )
 
 

@@ -61,7 +61,7 @@ def by_hand(i: int, j: int, age: float, params: Params) -> float:
             place = place + np.array([np.cos(yaw) * ax - np.sin(yaw) * ay, np.sin(yaw) * ax + np.cos(yaw) * ay])
         return np.append(place, params.height[slot])
 
-    return np.linalg.norm(antenna(i) - antenna(j)) + float(params.bias[i] + params.bias[j])
+    return float(np.linalg.norm(antenna(i) - antenna(j)) + params.bias[i] + params.bias[j])
 
 
 def measured(distances, ages=0.0, gap=np.nan, size=8) -> Ranges:
@@ -80,9 +80,7 @@ def test_slant_range_at_one_metre_with_0_8_m_of_height_is_0_28_m_longer():
     flat = flat_params(height=jnp.zeros(NODES))
     raised = flat_params(height=jnp.array([0.0, 0.8, 0.0, 0.0]))
     ranges = measured(np.zeros(6))
-    rise = predicted_ranges(vector(positions), ranges, raised) - predicted_ranges(
-        vector(positions), ranges, flat
-    )
+    rise = predicted_ranges(vector(positions), ranges, raised) - predicted_ranges(vector(positions), ranges, flat)
     assert 0.28 < float(rise[0]) < 0.29  # sqrt(1.64) - 1
     np.testing.assert_allclose(rise[1], 0.0, atol=1e-6)  # nodes of one height
 
@@ -198,9 +196,7 @@ def test_gradient_of_one_filter_step_agrees_with_finite_differences(params, robu
         changed = params._replace(**tunable)
         start = Gaussian(mean, root @ root.T)
         predicted = motion.predict(start, changed, jnp.array(0.1), none, jnp.zeros(NODES, bool), jnp.array(0.0))
-        after, used = update(
-            predicted, ranges._replace(range=distances), ranges.valid, changed, robust=robust
-        )
+        after, used = update(predicted, ranges._replace(range=distances), ranges.valid, changed, robust=robust)
         return weights @ after.mean + weights @ after.cov @ weights + 0.1 * used.log_likelihood
 
     at = (belief.mean, jnp.linalg.cholesky(belief.cov), ranges.range, {n: getattr(params, n) for n in names})

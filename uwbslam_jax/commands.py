@@ -17,7 +17,7 @@ import tyro
 from tqdm import tqdm
 from tyro.conf import Positional, arg
 
-from uwbslam_jax import config
+from uwbslam_jax import settings_file
 from uwbslam_jax.config import ConfigError, Settings
 from uwbslam_jax.log_summary import format_summary, inspect
 from uwbslam_jax.mcap_log import LogError, LogReader, LogWriter
@@ -127,9 +127,9 @@ def _settings_file(words: Sequence[str]) -> Settings:
     """The settings of the file given by --config: they are the defaults that the flags are read against."""
     for k, word in enumerate(words):
         if word == "--config" and k + 1 < len(words):
-            return config.load(words[k + 1])
+            return settings_file.load(words[k + 1])
         if word.startswith("--config="):
-            return config.load(word.removeprefix("--config="))
+            return settings_file.load(word.removeprefix("--config="))
     return Settings()
 
 
@@ -140,7 +140,7 @@ def run(options: RunOptions) -> None:
         settings = dataclasses.replace(settings, odom=dataclasses.replace(settings.odom, use=False))
     if options.lidar_only:
         settings = dataclasses.replace(settings, filter=dataclasses.replace(settings.filter, lidar_only=True))
-    _run_and_write(options.log, config.check(settings), options.out, quiet=options.quiet, online=options.online)
+    _run_and_write(options.log, settings_file.check(settings), options.out, quiet=options.quiet, online=options.online)
 
 
 def demo(options: DemoOptions) -> None:
@@ -149,7 +149,7 @@ def demo(options: DemoOptions) -> None:
     made = _scenario("workshop", options.seed, options.duration)
     log = options.out / "demo.mcap"
     _record(made, log, options.quiet)
-    settings = config.from_dict(settings_overrides(made))
+    settings = settings_file.from_dict(settings_overrides(made))
     _run_and_write(log, settings, options.out, quiet=options.quiet, title="UWB and LiDAR SLAM demo")
 
 
@@ -158,7 +158,7 @@ def simulate_scenario(options: SimulateOptions) -> None:
     made = _scenario(options.name, options.seed, options.duration)
     _record(made, options.out, options.quiet)
     print(f"recording: {options.out} ({made.duration:.1f} s)")
-    text = _differences(config.from_dict(settings_overrides(made)))
+    text = _differences(settings_file.from_dict(settings_overrides(made)))
     if text:
         path = options.out.with_suffix(".toml")
         path.write_text(text, encoding="utf-8")
@@ -175,7 +175,7 @@ def evaluate_run(options: EvaluateOptions) -> None:
 
 def inspect_log(options: InspectOptions) -> None:
     """The command `inspect`."""
-    s = config.load(options.config) if options.config else Settings()
+    s = settings_file.load(options.config) if options.config else Settings()
     topics = {"scan_topic": s.lidar.topic, "uwb_topic": s.uwb.topic, "odom_topic": s.odom.topic}
     print(format_summary(inspect(options.log, **topics, robot_id=s.robot.id, max_range=s.uwb.max_range)))
 
@@ -279,9 +279,9 @@ def _record(made: Scenario, path: Path, quiet: bool) -> None:
 
 def _differences(settings: Settings) -> str:
     """TOML of what differs from the defaults, "" where nothing does."""
-    usual = dict(_sections(config.dump(Settings())))
+    usual = dict(_sections(settings_file.dump(Settings())))
     blocks = []
-    for head, lines in _sections(config.dump(settings)):
+    for head, lines in _sections(settings_file.dump(settings)):
         if changed := [line for line in lines if line not in usual[head]]:
             blocks.append("\n".join([head, *changed]) + "\n")
     return "\n".join(blocks)

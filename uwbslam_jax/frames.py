@@ -163,8 +163,8 @@ class FrameAssembler:
             self.dropped["range: more than one frame holds"] += len(ranges) - self._max_ranges
             ranges = ranges[-self._max_ranges :]
         frame = Frame(
-            dt=np.float32(dt),  # pyright: ignore[reportArgumentType]
-            has_scan=np.bool_(scan is not None),  # pyright: ignore[reportArgumentType]
+            dt=np.float32(dt),
+            has_scan=np.bool_(scan is not None),
             scan=pad_scan(scan, self._settings),
             ranges=pad_ranges(ranges, self.slots, stamp, self._max_ranges),
             odometry=odometry,
@@ -174,7 +174,7 @@ class FrameAssembler:
 
     def _increment(self, stamp: int) -> Odometry:
         track, last = self._odometry, self._last
-        none = Odometry(np.zeros(3, np.float32), np.bool_(False))  # pyright: ignore[reportArgumentType]
+        none = Odometry(np.zeros(3, np.float32), np.bool_(False))
         if last is None or len(track) < 2 or track[0].stamp > last or stamp - track[-1].stamp > _ODOMETRY_HOLD_S * 1e9:
             return none
         a, b = _pose_at(track, last), _pose_at(track, stamp)
@@ -185,7 +185,7 @@ class FrameAssembler:
         dx, dy = b[0] - a[0], b[1] - a[1]
         turn = (b[2] - a[2] + np.pi) % (2 * np.pi) - np.pi
         increment = np.array([c * dx + s * dy, -s * dx + c * dy, turn], np.float32)
-        return Odometry(increment, np.bool_(True))  # pyright: ignore[reportArgumentType]
+        return Odometry(increment, np.bool_(True))
 
 
 def _pose_at(track: list[OdometryMessage], stamp: int) -> tuple[float, float, float]:
@@ -202,7 +202,7 @@ def pad_scan(scan: ScanMessage | None, settings: Settings) -> Scan:
     beams = settings.lidar.max_beams
     ranges, valid = np.zeros(beams, np.float32), np.zeros(beams, bool)
     if scan is None:
-        return Scan(ranges, valid, np.float32(0), np.float32(1e-3), np.float32(0))  # pyright: ignore[reportArgumentType]
+        return Scan(ranges, valid, np.float32(0), np.float32(1e-3), np.float32(0))
     stride = -(-scan.ranges.size // beams)
     taken = np.asarray(scan.ranges[::stride], np.float32)
     low, high = max(scan.range_min, settings.lidar.min_range), min(scan.range_max, settings.lidar.max_range)
@@ -210,11 +210,11 @@ def pad_scan(scan: ScanMessage | None, settings: Settings) -> Scan:
         ok = np.isfinite(taken) & (taken >= low) & (taken <= high) & (taken > 0)
     ranges[: taken.size], valid[: taken.size] = np.where(ok, taken, 0.0), ok
     return Scan(
-        ranges,  # pyright: ignore[reportArgumentType]
-        valid,  # pyright: ignore[reportArgumentType]
-        np.float32(scan.angle_min),  # pyright: ignore[reportArgumentType]
-        np.float32(scan.angle_increment * stride),  # pyright: ignore[reportArgumentType]
-        np.float32(scan.time_increment * stride),  # pyright: ignore[reportArgumentType]
+        ranges,
+        valid,
+        np.float32(scan.angle_min),
+        np.float32(scan.angle_increment * stride),
+        np.float32(scan.time_increment * stride),
     )
 
 
@@ -230,4 +230,4 @@ def pad_ranges(messages: list[RangeMessage], slots: dict[int, int], stamp: int, 
         distance[k], age[k] = m.range, (m.stamp - stamp) / 1e9
         gap[k] = m.receive_power - m.first_path_power
     valid[:n] = True
-    return Ranges(i, j, distance, age, gap, valid)  # pyright: ignore[reportArgumentType]
+    return Ranges(i, j, distance, age, gap, valid)

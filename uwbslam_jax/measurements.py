@@ -6,10 +6,10 @@ Nothing here reads a file, knows a sensor's protocol or computes an estimate.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 NAN = float("nan")
 
@@ -78,6 +78,9 @@ class TruthMessage:
     yaw: float = NAN
 
 
+Leaf = Any
+"""Numpy on the host, where frames are made; JAX arrays inside the step."""
+
 Message = RangeMessage | ScanMessage | OdometryMessage | TruthMessage
 
 
@@ -91,11 +94,11 @@ class Scan(NamedTuple):
       time_increment: time from beam to beam [s].
     """
 
-    ranges: Float[Array, "B"]
-    valid: Bool[Array, "B"]
-    angle_min: Float[Array, ""]
-    angle_increment: Float[Array, ""]
-    time_increment: Float[Array, ""]
+    ranges: Float[Leaf, "B"]
+    valid: Bool[Leaf, "B"]
+    angle_min: Float[Leaf, ""]
+    angle_increment: Float[Leaf, ""]
+    time_increment: Float[Leaf, ""]
 
 
 class Ranges(NamedTuple):
@@ -109,19 +112,19 @@ class Ranges(NamedTuple):
       valid: True where there is a measurement.
     """
 
-    i: Int[Array, "M"]
-    j: Int[Array, "M"]
-    range: Float[Array, "M"]
-    age: Float[Array, "M"]
-    power_gap: Float[Array, "M"]
-    valid: Bool[Array, "M"]
+    i: Int[Leaf, "M"]
+    j: Int[Leaf, "M"]
+    range: Float[Leaf, "M"]
+    age: Float[Leaf, "M"]
+    power_gap: Float[Leaf, "M"]
+    valid: Bool[Leaf, "M"]
 
 
 class Odometry(NamedTuple):
     """Motion since the last frame in the robot's frame at that time [m, m, rad]; valid False where there is none."""
 
-    increment: Float[Array, "3"]
-    valid: Bool[Array, ""]
+    increment: Float[Leaf, "3"]
+    valid: Bool[Leaf, ""]
 
 
 class Frame(NamedTuple):
@@ -133,8 +136,8 @@ class Frame(NamedTuple):
       scan, ranges, odometry: see there.
     """
 
-    dt: Float[Array, ""]
-    has_scan: Bool[Array, ""]
+    dt: Float[Leaf, ""]
+    has_scan: Bool[Leaf, ""]
     scan: Scan
     ranges: Ranges
     odometry: Odometry

@@ -273,12 +273,13 @@ def _belief(
     placed = np.concatenate([[2 * s, 2 * s + 1] for s in slots])
     R = rotation(values[2] - old_pose[2])
     mean[velocity] = R @ mean[velocity]
-    motion_cov = P[np.ix_([*velocity, 4 * nodes + 1], [*velocity, 4 * nodes + 1])]
+    moving = np.append(velocity, 4 * nodes + 1)
+    motion_cov = P[np.ix_(moving, moving)]
     motion_cov[:2] = R @ motion_cov[:2]
     motion_cov[:, :2] = motion_cov[:, :2] @ R.T
     P = np.eye(len(mean))
     P[beacon_velocities, beacon_velocities] = 1e-8
-    P[np.ix_([*velocity, 4 * nodes + 1], [*velocity, 4 * nodes + 1])] = motion_cov
+    P[np.ix_(moving, moving)] = motion_cov
     known = np.concatenate([pose, placed])
     P[np.ix_(known, known)] = cov
     P[np.ix_(error, known)] = -cov[:3]
