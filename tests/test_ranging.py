@@ -134,6 +134,22 @@ def test_update_by_many_ranges_is_the_textbook_update(params):
     np.testing.assert_allclose(used.log_likelihood, want, rtol=1e-8)
 
 
+@pytest.mark.usefixtures("x64")
+def test_robust_update_is_the_textbook_update_with_the_noise_of_doubted_ranges_raised(params):
+    params, belief = double(params), random_belief()
+    truth = np.array([by_hand(i, j, 0.0, params) for i, j in PAIRS])
+    ranges = measured(truth + np.array([0.1, -1.5, 0.02, 4.0, -0.2, 0.03]))
+    after, used = update(belief, ranges, ranges.valid, params, robust=True)
+    H = np.asarray(jax.jacfwd(predicted_ranges)(belief.mean, ranges, params))[:6]
+    P, weight = np.asarray(belief.cov), np.asarray(used.weight)[:6]
+    np.testing.assert_allclose(weight, ranging.robust_weight(used.normalised)[:6], rtol=1e-12)
+    assert weight.min() < 0.01 < 0.5 < weight.max()
+    S = H @ P @ H.T + np.diag(float(params.sigma_n) ** 2 / weight)
+    K = P @ H.T @ np.linalg.inv(S)
+    np.testing.assert_allclose(after.mean, belief.mean + K @ np.asarray(used.innovation)[:6], rtol=1e-8, atol=1e-9)
+    np.testing.assert_allclose(after.cov, P - K @ S @ K.T, atol=1e-9)
+
+
 def test_ranges_that_are_not_usable_change_nothing():
     belief = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), random_belief())
     wild = measured(np.full(6, 100.0))

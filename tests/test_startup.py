@@ -62,6 +62,11 @@ def test_published_frame_has_the_lowest_id_at_the_origin_and_the_farthest_beacon
     assert startup.choose_frame(outcome.placement, {0: 0, 1: 30, 2: 12, 3: 7}) == (3, 1)
 
 
+MOTION = [2 * CONFIG.nodes, 2 * CONFIG.nodes + 1, 4 * CONFIG.nodes + 1]
+"""Where velocity and yaw rate of the robot stand in the state vector."""
+MOTION_COV = np.array([[0.04, 0.01, 0.002], [0.01, 0.01, -0.003], [0.002, -0.003, 0.09]], np.float32)
+
+
 def adopted_case():
     """A decided start, and a LiDAR-only state that has driven a little on from the last keyframe."""
     kept = start_of_run.buffer(start_of_run.with_a_turn())
@@ -77,7 +82,10 @@ def adopted_case():
             yaw_rate=jnp.float32(0.1),
         )
     )
-    state = state._replace(belief=state.belief._replace(mean=mean))
+    at = np.array(MOTION)
+    cov = np.array(state.belief.cov)
+    cov[np.ix_(at, at)] = MOTION_COV
+    state = state._replace(belief=state.belief._replace(mean=mean, cov=jnp.asarray(cov)))
     frame_slots = startup.choose_frame(outcome.placement, IDS)
     adopted = startup.adopt(CONFIG, PARAMS, state, kept, outcome.placement, frame_slots)
     return outcome.placement, state, frame_slots, adopted, pose
@@ -145,6 +153,15 @@ def test_adopted_covariance_is_that_of_samples_put_through_the_change_of_frame()
     np.testing.assert_allclose(C @ P @ C.T, 0.0, atol=1e-8)
     np.testing.assert_allclose(P[np.ix_(error, error)], P[np.ix_(robot, robot)], atol=1e-10)
     assert np.linalg.eigvalsh((P + P.T) / 2).min() > -1e-7
+
+
+def test_covariance_of_the_velocity_turns_with_the_frame():
+    _, _, _, adopted, pose = adopted_case()
+    turn = float(layout.unpack(adopted.state.belief.mean).heading) - pose[2]
+    J = np.eye(3)
+    J[:2, :2] = startup.rotation(turn)
+    P = np.asarray(adopted.state.belief.cov)
+    np.testing.assert_allclose(P[np.ix_(MOTION, MOTION)], J @ MOTION_COV @ J.T, atol=1e-6)  # float32
 
 
 def test_earlier_poses_are_republished_with_the_keyframe_before_them():
