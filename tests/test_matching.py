@@ -32,7 +32,8 @@ def assess(grid, sweep, pose, resolution):
 
 @partial(jax.jit, static_argnums=4)
 def search(grid, sweep, prior, sigma_l, resolution):
-    return matching.search(grid, sweep, matching.blind_direction(sweep), prior, sigma_l, resolution)
+    blind = matching.blind_direction(sweep)
+    return matching.search(grid, sweep, blind, prior, prior.mean, sigma_l, resolution)
 
 
 def sweep_at(pose, beams=BEAMS, walls=room.WALLS):

@@ -26,6 +26,9 @@ _BLIND = (0.006, 0.02)
 _SEARCH_HEADINGS = 120
 _SEARCH_BEAMS = 180
 _SEARCH_REFINED = 8
+_UNLIKELY = 0.005
+"""What a squared Mahalanobis distance of one costs a searched place, in mean Gamma: as if 100 beams were independent.
+Headings cost nothing: the search is for a robot that turned."""
 
 
 class Match(NamedTuple):
@@ -159,12 +162,15 @@ def search(
     sweep: Sweep,
     blind: Blind,
     prior: Gaussian,
+    last: Float[Array, "3"],
     sigma_l: Float[Array, ""],
     resolution: float,
 ) -> Float[Array, "3"]:
-    """Best pose over the full circle of headings and a patch of positions around the prior's mean (DESIGN 1.8).
+    """Best pose over the full circle of headings and two patches of positions (DESIGN 1.8): around the prior's mean,
+    and around the last pose, because a robot that turned has often driven less far than its velocity said.
 
-    Every heading and position is scored at the middle level; the best few are aligned and scored at the finest.
+    Every heading and position is scored at the middle level; the best of each peak over the headings is aligned and
+    scored at the finest.
     """
     k = min(1, len(grid.levels) - 1)
     size = resolution * 2**k
@@ -172,28 +178,34 @@ def search(
     points, valid = sweep.points[::stride], sweep.valid[::stride]
     spread = jnp.clip(1.5 * jnp.sqrt(jnp.maximum(prior.cov[0, 0], prior.cov[1, 1])), 0.05, 0.6)
     axis = jnp.linspace(-1.0, 1.0, 5)
-    offsets = jnp.stack(jnp.meshgrid(axis, axis), axis=-1).reshape(-1, 2) * spread
+    patch = jnp.stack(jnp.meshgrid(axis, axis), axis=-1).reshape(-1, 2) * spread
+    centres = jnp.stack([prior.mean[:2], last[:2]])
+    places = (centres[:, None] + patch[None]).reshape(-1, 2)
     headings = prior.mean[2] + jnp.linspace(-jnp.pi, jnp.pi, _SEARCH_HEADINGS, endpoint=False)
 
     def scores(heading):
         c, s = jnp.cos(heading), jnp.sin(heading)
         turned = jnp.stack([c * points[:, 0] - s * points[:, 1], s * points[:, 0] + c * points[:, 1]], axis=-1)
-        ends = (turned[None] + (prior.mean[None, :2] + offsets)[:, None]).reshape(-1, 2)
+        ends = (turned[None] + places[:, None]).reshape(-1, 2)
         corners, at, inside = occupancy.corner_log_odds(grid.levels[k], grid.origin, size, ends)
         value, _ = occupancy.interpolate(jax.nn.sigmoid(corners), at, size)
-        gain = jnp.where(inside, value - 0.5, 0.0).reshape(offsets.shape[0], -1)
+        gain = jnp.where(inside, value - 0.5, 0.0).reshape(places.shape[0], -1)
         return jnp.sum(jnp.where(valid, gain, 0.0), axis=1)
 
-    table = jax.lax.map(scores, headings, batch_size=8)  # (headings, offsets)
-    best_offset = jnp.argmax(table, axis=1)
-    _, best = jax.lax.top_k(jnp.max(table, axis=1), _SEARCH_REFINED)
-    starts = jnp.concatenate([prior.mean[None, :2] + offsets[best_offset[best]], headings[best, None]], axis=1)
+    table = jax.lax.map(scores, headings, batch_size=8)  # (headings, places)
+    best_place = jnp.argmax(table, axis=1)
+    value = jnp.max(table, axis=1)
+    peak = (value >= jnp.roll(value, 1)) & (value >= jnp.roll(value, -1))
+    _, best = jax.lax.top_k(jnp.where(peak, value, -jnp.inf), _SEARCH_REFINED)
+    starts = jnp.concatenate([places[best_place[best]], headings[best, None]], axis=1)
 
     def refine(start):
         wide = Gaussian(start, prior.cov * 0 + jnp.diag(jnp.array([0.3, 0.3, 0.3]) ** 2))
         pose = align(grid, sweep, blind, start, wide, sigma_l, resolution)
         m = assess(grid, sweep, blind, pose, resolution)
-        return pose, (m.score - 0.5) * m.known
+        away = pose[None, :2] - centres
+        unlikely = jnp.sum(away * jnp.linalg.solve(prior.cov[:2, :2], away.T).T, axis=1)
+        return pose, (m.score - 0.5) * m.known - _UNLIKELY * jnp.min(unlikely)
 
     poses, values = jax.lax.map(refine, starts)
     pose = poses[jnp.argmax(values)]

@@ -27,6 +27,8 @@ from uwbslam_jax.measurements import Frame, Scan
 _KNOWN_ENOUGH = 0.25
 """Share of returns on observed cells below which a score says nothing: the robot looks at new ground."""
 _POOR_SCORE = 0.55
+_FOUND_KNOWN = 0.4
+"""A place found by the search is believed only where this share of the returns falls on observed cells."""
 _LOST_SCORE = 0.5
 _SURPRISE = 30.0
 """Squared Mahalanobis distance of a match beyond which it is not believed (chi-square, 3: 1e-6)."""
@@ -171,6 +173,7 @@ def _match_and_fuse(config, params, state, belief, frame, sweep, usable) -> tupl
     match, searched = _match(config, params, state, belief, sweep, frame.has_scan)
     surprise, information = _trust(match, belief, params)
     poor = ((match.known > _KNOWN_ENOUGH) & (match.score < _LOST_SCORE)) | (surprise > _SURPRISE)
+    poor = poor | (searched & (match.known < _FOUND_KNOWN))
     trusted = frame.has_scan & ~poor
     information = jnp.where(trusted, information, 0.0)
     belief = _fuse(belief, match.pose, information)
@@ -223,7 +226,9 @@ def _match(config, params, state, belief, sweep, has_scan) -> tuple[Match, Bool[
     wanted = has_scan & (match.known > _KNOWN_ENOUGH) & (match.score < _POOR_SCORE)
 
     def wide(_):
-        found = matching.search(state.grid, sweep, blind, prior, params.sigma_l, config.resolution)
+        found = matching.search(
+            state.grid, sweep, blind, prior, C @ state.belief.mean, params.sigma_l, config.resolution
+        )
         other = matching.assess(state.grid, sweep, blind, found, config.resolution)
         better = (other.score - 0.5) * other.known > (match.score - 0.5) * match.known + 0.02
         return jax.tree.map(lambda a, b: jnp.where(better, a, b), other, match)
