@@ -17,7 +17,6 @@ SETTINGS = Settings(
     uwb=UwbSettings(max_beacons=3, sigma_n=0.05),
     lidar=LidarSettings(max_beams=60),
     map=MapSettings(size_m=12.8, resolution=0.1, levels=2),
-    filter=FilterSettings(beam_share=0.5),  # beams 6 degrees apart share little
 )
 BEACONS = {10: np.array([-3.5, -2.5]), 20: np.array([4.0, -2.0]), 30: np.array([1.0, 3.0])}
 SECOND = 10**9

@@ -241,7 +241,7 @@ def test_the_whole_state_may_stand_anywhere(room_map):
 
 # Derivatives of the whole step. The decisions are held: no search, nothing near a threshold.
 
-TUNABLE = ("sigma_n", "sigma_l", "sigma_w", "sigma_map", "beam_share", "bias", "height", "antenna", "lidar")
+TUNABLE = ("sigma_n", "sigma_l", "sigma_w", "sigma_map", "independent_beams", "bias", "height", "antenna", "lidar")
 
 
 @pytest.mark.usefixtures("x64")

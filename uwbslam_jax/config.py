@@ -22,7 +22,7 @@ class Params(NamedTuple):
     """The tunable leaves, all differentiable. K = 1 + max_beacons slots, slot 0 is the robot.
 
     Attributes:
-      gamma, sigma_n, sigma_w, sigma_w_paper, sigma_w_yaw, sigma_w_beacon, sigma_l, beam_share, sigma_map,
+      gamma, sigma_n, sigma_w, sigma_w_paper, sigma_w_yaw, sigma_w_beacon, sigma_l, independent_beams, sigma_map,
         sigma_map_yaw: see FilterSettings and UwbSettings.
       odom_sigma_xy, odom_sigma_yaw, odom_sigma_floor: see OdomSettings.
       antenna: x, y of the UWB antenna on the robot [m].
@@ -38,7 +38,7 @@ class Params(NamedTuple):
     sigma_w_yaw: Float[Array, ""]
     sigma_w_beacon: Float[Array, ""]
     sigma_l: Float[Array, ""]
-    beam_share: Float[Array, ""]
+    independent_beams: Float[Array, ""]
     sigma_map: Float[Array, ""]
     sigma_map_yaw: Float[Array, ""]
     odom_sigma_xy: Float[Array, ""]
@@ -176,8 +176,8 @@ class FilterSettings:
     """Random walk of a beacon at rest [m/s^0.5]."""
     sigma_l: float = 0.25
     """Standard deviation of one beam's residual 1 - Gamma."""
-    beam_share: float = 0.05
-    """Share of the beams that counts as independent in a match's information."""
+    independent_beams: float = 50.0
+    """So many beams of a scan count as independent in a match's information, however many there are."""
     sigma_map: float = 0.08
     """Standard deviation of the map's own position error where it was drawn while exploring [m]."""
     sigma_map_yaw: float = 0.01
@@ -232,7 +232,7 @@ def make_params(settings: Settings, slots: dict[int, int] | None = None) -> Para
             height[slot] = settings.uwb.height.get(str(node), settings.robot.antenna[2])
     of_filter = ("gamma", "sigma_w", "sigma_w_paper", "sigma_w_yaw", "sigma_w_beacon", "sigma_l")
     leaves: dict[str, Any] = {name: getattr(f, name) for name in of_filter}
-    leaves |= {name: getattr(f, name) for name in ("beam_share", "sigma_map", "sigma_map_yaw")}
+    leaves |= {name: getattr(f, name) for name in ("independent_beams", "sigma_map", "sigma_map_yaw")}
     leaves |= {f"odom_{name}": getattr(odom, name) for name in ("sigma_xy", "sigma_yaw", "sigma_floor")}
     leaves |= {"sigma_n": settings.uwb.sigma_n, "antenna": settings.robot.antenna[:2], "lidar": settings.robot.lidar}
     leaves |= {"bias": bias, "height": height}

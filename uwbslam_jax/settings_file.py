@@ -23,7 +23,7 @@ _POSITIVE = [
         "filter.sigma_w_yaw",
         "filter.sigma_w_beacon",
         "filter.sigma_l",
-        "filter.beam_share",
+        "filter.independent_beams",
     ),
     *("filter.sigma_map", "filter.sigma_map_yaw"),
 ]
@@ -34,7 +34,6 @@ _LIMITS = {
     "uwb.max_beacons": (1, 200),
     "lidar.max_beams": (1, 100_000),
     "map.levels": (1, 5),
-    "filter.beam_share": (0, 1),
 }
 
 

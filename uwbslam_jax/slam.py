@@ -171,7 +171,7 @@ def _match_and_fuse(config, params, state, belief, frame, sweep, usable) -> tupl
     """Preset "robust": align the scan fully, search where that fails, fuse what it is worth (DESIGN 1.8, 1.9)."""
     del usable  # the ranges are in the belief already: every measurement counts once
     match, searched = _match(config, params, state, belief, sweep, frame.has_scan)
-    surprise, information = _trust(match, belief, params)
+    surprise, information = _trust(match, belief, params, jnp.sum(sweep.valid))
     poor = ((match.known > _KNOWN_ENOUGH) & (match.score < _LOST_SCORE)) | (surprise > _SURPRISE)
     poor = poor | (searched & (match.known < _FOUND_KNOWN))
     trusted = frame.has_scan & ~poor
@@ -236,14 +236,17 @@ def _match(config, params, state, belief, sweep, has_scan) -> tuple[Match, Bool[
     return lax.cond(wanted, wide, lambda _: match, None), wanted
 
 
-def _trust(match: Match, belief: Gaussian, params: Params) -> tuple[Float[Array, ""], Float[Array, "3 3"]]:
+def _trust(
+    match: Match, belief: Gaussian, params: Params, beams: Int[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, "3 3"]]:
     """How surprising a match is, and its information about pose + map error.
 
-    The information is its Hessian, for the share of beams that count as independent, and never better than the floor
+    The information is its Hessian, for as many of its beams as count as independent, and never better than the floor
     (Y^-1 + floor)^-1. The surprise is the squared Mahalanobis distance to what was expected; information falls with
     it as with a range's (Geman-McClure), so that a plausible match of the wrong place cannot drag the state.
     """
-    Y = match.information * (params.beam_share / params.sigma_l**2)
+    share = params.independent_beams / jnp.maximum(beams, params.independent_beams)
+    Y = match.information * (share / params.sigma_l**2)
     floor = jnp.diag(jnp.array(_MATCH_FLOOR) ** 2)
     Y = jnp.linalg.solve(jnp.eye(3) + Y @ floor, Y)
     C = layout.matched_pose_jacobian(layout.node_count(belief.mean.shape[0]))
