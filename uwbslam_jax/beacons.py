@@ -13,9 +13,10 @@ from dataclasses import dataclass, field
 import jax.numpy as jnp
 import numpy as np
 
+from uwbslam_jax import layout
 from uwbslam_jax.config import Params, Settings
 from uwbslam_jax.ekf import Gaussian
-from uwbslam_jax.measurements import StampedFrame
+from uwbslam_jax.measurements import Ranges, StampedFrame
 from uwbslam_jax.placement import locate, rotation
 from uwbslam_jax.slam import Estimate, State
 
@@ -26,16 +27,22 @@ _DROP_S = 60.0
 _MISFIT = 4.0
 """Median absolute normalised innovation of a node's ranges beyond which it is not where the state has it."""
 _MISFIT_S = 1.0
+_CARRIED_SHARE = 0.7
+"""When the robot's ranges to this share of the beacons stop fitting at once, it is the robot that was carried."""
+_CARRIED_S = 0.5
 
 
 @dataclass
 class _Life:
-    """What the host knows of one slot. heard, placed_at: stamps [ns]."""
+    """What the host knows of one slot. heard: stamp [ns]; anchors: (stamp, known place, distance) of a node yet to be
+    placed; misfits: (stamp, absolute normalised innovation); from_robot: the same of the robot's ranges, with the
+    distance [m]."""
 
     status: str = "waiting"
     heard: int = 0
     anchors: deque[tuple[int, np.ndarray, float]] = field(default_factory=deque)
     misfits: deque[tuple[int, float]] = field(default_factory=deque)
+    from_robot: deque[tuple[int, float, float]] = field(default_factory=deque)
 
 
 class BeaconKeeper:
@@ -67,10 +74,15 @@ class BeaconKeeper:
             self._listen(frame, estimate, params)
         now = pending[-1][0].stamp
         events: list[tuple[int, str]] = []
-        for slot, life in sorted(self._lives.items()):
-            for buffer in (life.anchors, life.misfits):
+        for life in self._lives.values():
+            for buffer in (life.anchors, life.misfits, life.from_robot):
                 while buffer and now - buffer[0][0] > _BUFFER_S * 1e9:
                     buffer.popleft()
+        if (found := self._find_carried_robot(state, now)) is not None:
+            for life in self._lives.values():
+                life.misfits.clear()  # they were not the beacons' fault
+            return _put_robot(state, found), [(0, "was carried: found again by its ranges")]
+        for slot, life in sorted(self._lives.items()):
             if life.status in ("static", "silent"):
                 state = self._watch(state, slot, life, now, events)
             else:
@@ -90,12 +102,30 @@ class BeaconKeeper:
                 life.heard = frame.stamp
                 if estimate.active[slot]:
                     if estimate.active[other]:
-                        life.misfits.append((frame.stamp, abs(float(estimate.normalised[k]))))
+                        misfit = abs(float(estimate.normalised[k]))
+                        life.misfits.append((frame.stamp, misfit))
+                        if other == 0:
+                            life.from_robot.append((frame.stamp, misfit, _flat(r, k, slot, other, params)))
                 elif estimate.active[other]:
                     place = self._place_of(other, pose, estimate, float(r.age[k]), params)
-                    rise = float(params.height[slot] - params.height[other])
-                    slant = float(r.range[k] - params.bias[slot] - params.bias[other])
-                    life.anchors.append((frame.stamp, place, float(np.sqrt(max(slant**2 - rise**2, 0.01)))))
+                    life.anchors.append((frame.stamp, place, _flat(r, k, slot, other, params)))
+
+    def _find_carried_robot(self, state: State, now: int) -> np.ndarray | None:
+        """Where the robot is by its ranges alone, when they say that it is not where the state has it."""
+        anchors, distance, misfit = [], [], []
+        mean, active = np.asarray(state.belief.mean, float), np.asarray(state.active)
+        for slot, life in self._lives.items():
+            recent = [row for row in life.from_robot if now - row[0] < _CARRIED_S * 1e9]
+            if len(recent) < 2 or not active[slot]:
+                continue
+            misfit.append(float(np.median([row[1] for row in recent])) > _MISFIT)
+            anchors += [mean[2 * slot : 2 * slot + 2]] * 2
+            distance += [row[2] for row in recent[-2:]]
+        if len(misfit) < 3 or np.mean(misfit) < _CARRIED_SHARE:
+            return None
+        # the newest ranges were taken on the move: a few decimetres are as good as they get
+        found = locate(np.array(anchors), np.array(distance), np.full(len(distance), 2 * self._sigma_n))
+        return None if found is None else found[0]
 
     @staticmethod
     def _place_of(slot: int, pose: np.ndarray, estimate: Estimate, age: float, params: Params) -> np.ndarray:
@@ -134,6 +164,24 @@ class BeaconKeeper:
         life.misfits.clear()
         events.append((slot, "placed"))
         return _with(state, slot, *place)
+
+
+def _flat(r: Ranges, k: int, i: int, j: int, params: Params) -> float:
+    """Distance in the plane of one range between two slots, biases and heights taken off [m]."""
+    rise = float(params.height[i] - params.height[j])
+    slant = float(r.range[k] - params.bias[i] - params.bias[j])
+    return float(np.sqrt(max(slant**2 - rise**2, 0.01)))
+
+
+def _put_robot(state: State, position: np.ndarray) -> State:
+    """The state with the robot somewhere else: at rest, heading unknown, the map where it was."""
+    k = state.active.shape[0]
+    rows = jnp.array([0, 1, 2 * k, 2 * k + 1, 4 * k, 4 * k + 1, *layout.map_error_indices(k)])
+    variance = jnp.array([0.3**2, 0.3**2, 1.0, 1.0, 10.0, 1.0, 0.05**2, 0.05**2, 0.01**2])
+    mean = state.belief.mean.at[rows].set(0.0).at[:2].set(jnp.asarray(position, jnp.float32))
+    mean = mean.at[4 * k].set(state.belief.mean[4 * k])
+    P = state.belief.cov.at[rows, :].set(0.0).at[:, rows].set(0.0).at[rows, rows].set(variance)
+    return state._replace(belief=Gaussian(mean, P))
 
 
 def _with(state: State, slot: int, position: np.ndarray, cov: np.ndarray) -> State:

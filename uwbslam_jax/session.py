@@ -175,7 +175,8 @@ class Session:
         ids = {slot: node for node, slot in self._slots.items()}
         self.state, events = self._keeper.look(self.state, self.params, pending)
         for slot, text in events:
-            self.history.event(pending[-1][0].stamp, f"beacon {ids[slot]} {text}")
+            who = "robot" if slot == 0 else f"beacon {ids[slot]}"
+            self.history.event(pending[-1][0].stamp, f"{who} {text}")
 
     def beacon_status(self, slot: int) -> str:
         """static, moving, silent, dropped or waiting."""
