@@ -27,8 +27,10 @@ _DROP_S = 60.0
 _MISFIT = 4.0
 """Median absolute normalised innovation of a node's ranges beyond which it is not where the state has it."""
 _MISFIT_S = 1.0
-_CARRIED_SHARE = 0.7
-"""When the robot's ranges to this share of the beacons stop fitting at once, it is the robot that was carried."""
+_CARRIED_SHARE = 0.4
+_FOUND_SHARE = 0.7
+"""When the robot's ranges to so many of the beacons stop fitting at once, and one other place explains so many of
+them, it is the robot that was carried. The filter may have settled where two or three of them fit by chance."""
 _CARRIED_S = 0.5
 
 
@@ -125,7 +127,10 @@ class BeaconKeeper:
             return None
         # the newest ranges were taken on the move: a few decimetres are as good as they get
         found = locate(np.array(anchors), np.array(distance), np.full(len(distance), 2 * self._sigma_n))
-        return None if found is None else found[0]
+        if found is None:
+            return None
+        left = np.abs(np.linalg.norm(np.array(anchors) - found[0], axis=1) - distance)
+        return found[0] if np.mean(left < _MISFIT * self._sigma_n) > _FOUND_SHARE else None
 
     @staticmethod
     def _place_of(slot: int, pose: np.ndarray, estimate: Estimate, age: float, params: Params) -> np.ndarray:
