@@ -45,6 +45,7 @@ class World:
         self.events: list[tuple[float, int, str]] = []
         self.time = 0.0
         self.excess = np.zeros(4)
+        self.carried = np.zeros(2)  # where the robot is minus where the estimate has it
         self._straight, self._rng = straight, np.random.default_rng(seed)
         for slot in np.flatnonzero(np.asarray(state.active)[1:]) + 1:
             self.keeper.placed(int(slot), 0)
@@ -73,10 +74,10 @@ class World:
         rise = np.asarray(self.params.height)[slots] - float(self.params.height[0])
         bias = np.asarray(self.params.bias)[slots] + float(self.params.bias[0])
 
-        def slant(points):
-            return np.hypot(np.linalg.norm(points[slots] - antenna, axis=1), rise) + bias
+        def slant(points, carried=0.0):
+            return np.hypot(np.linalg.norm(points[slots] - antenna - carried, axis=1), rise) + bias
 
-        z = slant(self.positions) + self.excess[slots] + 0.1 * self._rng.normal(size=len(slots))
+        z = slant(self.positions, self.carried) + self.excess[slots] + 0.1 * self._rng.normal(size=len(slots))
         ranges = room.ranges(pairs, z, CONFIG.max_ranges, gap=gap)
         normalised = np.zeros(CONFIG.max_ranges, np.float32)
         normalised[: len(slots)] = (z - slant(estimated)) / 0.12
@@ -136,6 +137,30 @@ def test_a_beacon_behind_walls_by_its_powers_is_not_placed():
     world = World(known(1, 2))
     world.run(12.0, (3,), gap=20.0)
     assert world.keeper.status(3) == "waiting"
+
+
+def test_a_robot_that_was_carried_is_put_where_its_ranges_say_and_no_beacon_is_blamed():
+    world = World(known(1, 2, 3))
+    world.run(3.0, (1, 2, 3))
+    assert world.events == []
+    world.carried = np.array([0.0, -4.0])
+    world.run(1.0, (1, 2, 3))
+    assert [(slot, text) for _, slot, text in world.events] == [(0, "was carried: found again by its ranges")]
+    place = np.asarray(world.state.belief.mean[:2], float)
+    np.testing.assert_allclose(place, world.pose()[:2] + world.carried, atol=0.3)  # its own stated sigma
+    np.testing.assert_array_equal(np.asarray(world.state.active), True)
+    for slot in (1, 2, 3):
+        np.testing.assert_array_equal(world.position(slot), BEACONS[slot])
+    P = np.asarray(world.state.belief.cov, float)
+    assert P[16, 16] > np.pi  # the heading is anyone's guess
+    assert np.linalg.eigvalsh(P)[0] > 0
+
+
+def test_one_beacon_that_was_moved_does_not_carry_the_robot():
+    world = World(known(1, 2, 3))
+    world.excess[3] = 3.0
+    world.run(3.0, (1, 2, 3))
+    assert all(slot == 3 for _, slot, _ in world.events)
 
 
 def test_a_silent_beacon_keeps_its_place_and_is_dropped_after_a_minute():

@@ -32,6 +32,8 @@ _FOUND_SHARE = 0.7
 """When the robot's ranges to so many of the beacons stop fitting at once, and one other place explains so many of
 them, it is the robot that was carried. The filter may have settled where two or three of them fit by chance."""
 _CARRIED_S = 0.5
+_NEWEST = 4
+"""So many of a beacon's newest ranges place a robot that was carried."""
 
 
 @dataclass
@@ -80,9 +82,11 @@ class BeaconKeeper:
             for buffer in (life.anchors, life.misfits, life.from_robot):
                 while buffer and now - buffer[0][0] > _BUFFER_S * 1e9:
                     buffer.popleft()
-        if (found := self._find_carried_robot(state, now)) is not None:
+        share, found = self._find_carried_robot(state, now)
+        if share > _FOUND_SHARE or found is not None:
             for life in self._lives.values():
-                life.misfits.clear()  # they were not the beacons' fault
+                life.misfits.clear()  # so many at once are not the beacons' fault
+        if found is not None:
             return _put_robot(state, found), [(0, "was carried: found again by its ranges")]
         for slot, life in sorted(self._lives.items()):
             if life.status in ("static", "silent"):
@@ -95,7 +99,7 @@ class BeaconKeeper:
         """Remember each usable range to a beacon: how it fits, or what it says about a place yet unknown."""
         r = frame.frame.ranges
         pose = np.asarray(estimate.pose, float)
-        for k in np.flatnonzero(r.valid & ~(r.power_gap > self._nlos_gap_db)):
+        for k in map(int, np.flatnonzero(r.valid & ~(r.power_gap > self._nlos_gap_db))):
             i, j = int(r.i[k]), int(r.j[k])
             for slot, other in ((i, j), (j, i)):
                 if slot == 0:
@@ -112,8 +116,9 @@ class BeaconKeeper:
                     place = self._place_of(other, pose, estimate, float(r.age[k]), params)
                     life.anchors.append((frame.stamp, place, _flat(r, k, slot, other, params)))
 
-    def _find_carried_robot(self, state: State, now: int) -> np.ndarray | None:
-        """Where the robot is by its ranges alone, when they say that it is not where the state has it."""
+    def _find_carried_robot(self, state: State, now: int) -> tuple[float, np.ndarray | None]:
+        """Share of the beacons that the robot's ranges do not fit, and where the robot is by its ranges alone when
+        they say that it is not where the state has it."""
         anchors, distance, misfit = [], [], []
         mean, active = np.asarray(state.belief.mean, float), np.asarray(state.active)
         for slot, life in self._lives.items():
@@ -121,16 +126,18 @@ class BeaconKeeper:
             if len(recent) < 2 or not active[slot]:
                 continue
             misfit.append(float(np.median([row[1] for row in recent])) > _MISFIT)
-            anchors += [mean[2 * slot : 2 * slot + 2]] * 2
-            distance += [row[2] for row in recent[-2:]]
-        if len(misfit) < 3 or np.mean(misfit) < _CARRIED_SHARE:
-            return None
+            newest = recent[-_NEWEST:]
+            anchors += [mean[2 * slot : 2 * slot + 2]] * len(newest)
+            distance += [row[2] for row in newest]
+        share = float(np.mean(misfit)) if len(misfit) >= 3 else 0.0
+        if share < _CARRIED_SHARE:
+            return share, None
         # the newest ranges were taken on the move: a few decimetres are as good as they get
         found = locate(np.array(anchors), np.array(distance), np.full(len(distance), 2 * self._sigma_n))
         if found is None:
-            return None
+            return share, None
         left = np.abs(np.linalg.norm(np.array(anchors) - found[0], axis=1) - distance)
-        return found[0] if np.mean(left < _MISFIT * self._sigma_n) > _FOUND_SHARE else None
+        return share, found[0] if np.mean(left < _MISFIT * self._sigma_n) > _FOUND_SHARE else None
 
     @staticmethod
     def _place_of(slot: int, pose: np.ndarray, estimate: Estimate, age: float, params: Params) -> np.ndarray:
