@@ -21,7 +21,8 @@ def with_tables(readme: str, tables: list[str]) -> str:
 
 def main() -> None:
     """Rewrite the README in place."""
-    tables = [path.read_text(encoding="utf-8") for path in sorted(RESULTS.glob("*.md"))]
+    # a table's own headline is one below the README's sections
+    tables = ["##" + path.read_text(encoding="utf-8") for path in sorted(RESULTS.glob("*.md"))]
     README.write_text(with_tables(README.read_text(encoding="utf-8"), tables), encoding="utf-8")
 
 

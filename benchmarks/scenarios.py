@@ -144,18 +144,19 @@ def table(name: str, rows: list[Row], facts: dict[str, str]) -> str:
     if bar:
         limits = f"robot RMS {bar[0]:g} m, beacons mean {bar[1]:g} m, heading median {bar[2]:g} deg"
         lines += [f"Bar for every seed: {limits}, every beacon placed.", ""]
-    lines += [_line(head), _line(["---:"] * len(head))]
+    lines += [line(head), line(["---:"] * len(head))]
     for row in rows:
         verdict = [("pass" if row.passes(bar) else "FAIL")] if bar else []
-        lines.append(_line([str(row.seed), *_cells([row]), *verdict]))
+        lines.append(line([str(row.seed), *_cells([row]), *verdict]))
     passed = [f"{sum(row.passes(bar) for row in rows)} of {len(rows)}"] if bar else []
-    lines.append(_line(["median", *_cells(rows), *passed]))
-    lines.append(_line(["worst", *_cells(rows, worst=True), *([""] if bar else [])]))
+    lines.append(line(["median", *_cells(rows), *passed]))
+    lines.append(line(["worst", *_cells(rows, worst=True), *([""] if bar else [])]))
     missing = [f"seed {row.seed}: {', '.join(map(str, row.beacons_missing))}" for row in rows if row.beacons_missing]
     return "\n".join([*lines, *(["", f"Beacons not placed: {'; '.join(missing)}."] if missing else [])]) + "\n"
 
 
-def _line(cells: list[str]) -> str:
+def line(cells: list[str]) -> str:
+    """One row of a Markdown table."""
     return f"| {' | '.join(cells)} |"
 
 
@@ -180,7 +181,7 @@ def run_scenario(name: str, seeds: int, workers: int, duration: float | None) ->
     rows = []
     for row in run_seeds(name, seeds, workers, duration):
         rows.append(row)
-        print(f"{name}: {_line([str(row.seed), *_cells([row])])}", file=sys.stderr, flush=True)
+        print(f"{name}: {line([str(row.seed), *_cells([row])])}", file=sys.stderr, flush=True)
     text = table(name, rows, facts)
     print(text)
     if duration is None:  # shorter ones are for trying out
