@@ -13,8 +13,8 @@ PACKAGE = Path(__file__).parents[1] / "uwbslam_jax"
 FLOORS: dict[float, str] = {
     0: "__init__",
     1: "geometry measurements config ekf result layout mcap_records paths",
-    2: "motion ranging grid metrics settings_file frames ros_types worlds placement",
-    2.1: "schemas result_log conditions",
+    2: "motion ranging grid metrics settings_file frames ros_types worlds multilateration",
+    2.1: "placement schemas result_log conditions",
     2.2: "mcap_log scenarios",
     2.3: "log_summary",
     3: "objective tiles",

@@ -7,7 +7,7 @@ import pytest
 import start_of_run
 from scipy.optimize import least_squares
 
-from uwbslam_jax import placement
+from uwbslam_jax import multilateration
 from uwbslam_jax.placement import Problem
 
 
@@ -74,13 +74,13 @@ def test_mirror_of_a_straight_track_explains_the_ranges_as_well():
     found = p.minimise(truth())
     mirrored = p.minimise(p.mirror(found))
     np.testing.assert_allclose(mirrored.beacons, truth() * [1, -1], atol=0.3)
-    assert abs(found.cost - mirrored.cost) < placement.DECIDED
+    assert abs(found.cost - mirrored.cost) < multilateration.DECIDED
 
 
 def test_mirror_of_a_track_with_a_turn_does_not():
     p = problem()
     found = p.minimise(truth())
-    assert p.minimise(p.mirror(found)).cost - found.cost > 10 * placement.DECIDED
+    assert p.minimise(p.mirror(found)).cost - found.cost > 10 * multilateration.DECIDED
 
 
 def test_starts_put_all_beacons_on_consistent_sides():
@@ -127,14 +127,14 @@ RING = 4.0 * np.stack([np.cos(np.arange(8)), np.sin(np.arange(8))], axis=1)
 def test_multilateration_finds_a_place_from_exact_ranges():
     spot = np.array([1.3, -2.1])
     distance = np.linalg.norm(RING - spot, axis=1)
-    best, second = placement.multilaterate(RING, distance, np.full(8, 0.1))
+    best, second = multilateration.multilaterate(RING, distance, np.full(8, 0.1))
     np.testing.assert_allclose(best, spot, atol=1e-3)
     assert second.shape == (2,)
 
 
 def test_multilateration_from_a_line_finds_both_places():
     line, spot = np.stack([np.arange(6.0), np.zeros(6)], axis=1), np.array([2.0, 3.0])
-    places = placement.multilaterate(line, np.linalg.norm(line - spot, axis=1), np.full(6, 0.1))
+    places = multilateration.multilaterate(line, np.linalg.norm(line - spot, axis=1), np.full(6, 0.1))
     np.testing.assert_allclose(sorted(p[1] for p in places), [-3.0, 3.0], atol=1e-3)
     np.testing.assert_allclose([p[0] for p in places], [2.0, 2.0], atol=1e-3)
 
@@ -143,13 +143,13 @@ def test_locate_states_a_place_only_where_there_is_one():
     rng = np.random.default_rng(0)
     spot, sigma = np.array([1.3, -2.1]), np.full(8, 0.1)
     noisy = np.linalg.norm(RING - spot, axis=1) + 0.1 * rng.normal(size=8)
-    found = placement.locate(RING, noisy, sigma)
+    found = multilateration.locate(RING, noisy, sigma)
     assert found is not None
     place, cov = found
     assert (place - spot) @ np.linalg.solve(cov, place - spot) < 13.8  # chi-square of 2, 1 in 1000
     line = np.stack([np.arange(8.0), np.zeros(8)], axis=1)
-    assert placement.locate(line, np.linalg.norm(line - spot, axis=1), sigma) is None  # either side
+    assert multilateration.locate(line, np.linalg.norm(line - spot, axis=1), sigma) is None  # either side
     near = 0.05 * RING
-    assert placement.locate(near, np.linalg.norm(near - [9.0, 9.0], axis=1), sigma) is None  # not certain enough
+    assert multilateration.locate(near, np.linalg.norm(near - [9.0, 9.0], axis=1), sigma) is None  # not certain enough
     carried = np.linalg.norm(RING - spot, axis=1) + np.array([2.0, -2.0] * 4)
-    assert placement.locate(RING, carried, sigma) is None  # no one place
+    assert multilateration.locate(RING, carried, sigma) is None  # no one place

@@ -17,7 +17,8 @@ from uwbslam_jax import layout
 from uwbslam_jax.config import Params, Settings
 from uwbslam_jax.ekf import Gaussian
 from uwbslam_jax.measurements import Ranges, StampedFrame
-from uwbslam_jax.placement import locate, rotation
+from uwbslam_jax.multilateration import locate
+from uwbslam_jax.placement import rotation
 from uwbslam_jax.slam import Estimate, State
 
 _BUFFER_S = 12.0

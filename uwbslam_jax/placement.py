@@ -11,18 +11,11 @@ from itertools import pairwise
 import numpy as np
 
 from uwbslam_jax.measurements import StampedFrame
+from uwbslam_jax.multilateration import DECIDED, RANGE_FLOOR_M, multilaterate, soften
 
-_SOFT = 4.0
-"""Whitened residual at which a range's influence starts to fall (Geman-McClure)."""
-_RANGE_FLOOR_M = 0.02
-"""However many ranges are averaged, their mean is not better than this."""
 _MOST_MOVES = 20
 _ENOUGH = 0.02
 """The batch problem is solved when a move gains less log-likelihood than this."""
-DECIDED = 15.0
-"""Difference of log-likelihood that decides between two explanations."""
-SIGMA_ENOUGH_M = 0.15
-"""A beacon enters when its position is known this well among the others."""
 
 
 @dataclass
@@ -116,7 +109,7 @@ class Problem:
         steps, roots = _steps(keys)
 
         def sigma(count):
-            return np.sqrt(sigma_n**2 / np.maximum(count, 1) + _RANGE_FLOOR_M**2)
+            return np.sqrt(sigma_n**2 / np.maximum(count, 1) + RANGE_FLOOR_M**2)
 
         return Problem(
             slots=slots,
@@ -245,7 +238,7 @@ class Problem:
         d = np.maximum(np.linalg.norm(u, axis=1), 1e-6)
         unit = u / d[:, None]
         lever = antenna - poses[self.at, :2]
-        r, scale = _soften((d - self.distance) / self.sigma)
+        r, scale = soften((d - self.distance) / self.sigma)
         weight = scale / self.sigma
         rows, J = np.arange(len(d)), np.zeros((len(d), columns))
         for axis in range(2):
@@ -258,7 +251,7 @@ class Problem:
         i, j = self.pair.T
         u = beacons[i] - beacons[j]
         d = np.maximum(np.linalg.norm(u, axis=1), 1e-6)
-        r, scale = _soften((d - self.pair_distance) / self.pair_sigma)
+        r, scale = soften((d - self.pair_distance) / self.pair_sigma)
         weight = (scale / self.pair_sigma / d)[:, None] * u
         rows, J = np.arange(len(d)), np.zeros((len(d), columns))
         for axis in range(2):
@@ -280,32 +273,6 @@ class Problem:
             near = np.linalg.norm(away - best.beacons[b]) < max(4 * sigma[b], 0.3)
             unique.append(near or 0.5 * r @ r - best.cost > DECIDED)
         return best.only([b for b, ok in enumerate(unique) if ok])
-
-
-def multilaterate(anchors: np.ndarray, distance: np.ndarray, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The best and the second-best place of one node, from ranges to known points; the same place twice where there
-    is no second.
-
-    Args:
-      anchors: (R, 2) [m]; distance, sigma: (R,) [m].
-    """
-    first = np.argmin(sigma)
-    angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
-    spots = anchors[first] + distance[first] * np.stack([np.cos(angle), np.sin(angle)], -1)
-    cost = np.zeros(len(spots))
-    for _ in range(12):  # Gauss-Newton from every start at once
-        u = spots[:, None] - anchors
-        d = np.maximum(np.linalg.norm(u, axis=2), 1e-6)
-        r, scale = _soften((d - distance) / sigma)
-        J = (scale / sigma / d)[..., None] * u
-        A = np.einsum("sri,srj->sij", J, J) + 1e-3 * np.eye(2)
-        move = np.linalg.solve(A, np.einsum("sri,sr->si", J, r)[..., None])[..., 0]
-        spots = spots - np.clip(move, -2.0, 2.0)
-        cost = 0.5 * (r**2).sum(1)
-    order = np.argsort(cost)
-    best = spots[order[0]]
-    apart = [k for k in order if np.linalg.norm(spots[k] - best) > 0.5]
-    return best, spots[apart[0]] if apart else best
 
 
 def _average(seen: list[tuple[np.ndarray, float]]) -> tuple[np.ndarray, float, int]:
@@ -336,39 +303,6 @@ def _steps(keys: list[Keyframe]) -> tuple[np.ndarray, np.ndarray]:
     return steps, roots
 
 
-def _soften(whitened: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Residual whose half square is the Geman-McClure loss, and its derivative."""
-    inside = 1.0 + (whitened / _SOFT) ** 2
-    return whitened / np.sqrt(inside), inside**-1.5
-
-
 def rotation(theta: float) -> np.ndarray:
     c, s = np.cos(theta), np.sin(theta)
     return np.array([[c, -s], [s, c]])
-
-
-def locate(anchors: np.ndarray, distance: np.ndarray, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Place (2,) and covariance (2, 2) of a node from ranges to known points, None where they do not determine it.
-
-    Args:
-      anchors: (R, 2) [m]; distance, sigma: (R,) [m].
-    """
-    best, second = multilaterate(anchors, distance, sigma)
-    cost, cov = _fit(best, anchors, distance, sigma)
-    if np.sqrt(np.linalg.eigvalsh(cov)[-1]) > SIGMA_ENOUGH_M:
-        return None
-    other, _ = _fit(second, anchors, distance, sigma)
-    if np.linalg.norm(second - best) > 0.3 and other - cost < DECIDED:
-        return None
-    residual = np.linalg.norm(anchors - best, axis=1) - distance
-    if np.median(np.abs(residual)) > 3 * np.median(sigma):
-        return None  # still being carried: no one place explains the ranges
-    return best, cov + _RANGE_FLOOR_M**2 * np.eye(2)
-
-
-def _fit(spot: np.ndarray, anchors: np.ndarray, distance: np.ndarray, sigma: np.ndarray) -> tuple[float, np.ndarray]:
-    u = spot - anchors
-    d = np.maximum(np.linalg.norm(u, axis=1), 1e-6)
-    r, scale = _soften((d - distance) / sigma)
-    J = (scale / sigma / d)[:, None] * u
-    return 0.5 * float(r @ r), np.linalg.inv(J.T @ J + 1e-6 * np.eye(2))

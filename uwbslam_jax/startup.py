@@ -19,7 +19,8 @@ from uwbslam_jax import layout, slam
 from uwbslam_jax.config import Config, Params
 from uwbslam_jax.ekf import Gaussian
 from uwbslam_jax.measurements import Ranges, Scan, StampedFrame
-from uwbslam_jax.placement import DECIDED, SIGMA_ENOUGH_M, Keyframe, Placement, Problem, largest_sigma, rotation
+from uwbslam_jax.multilateration import DECIDED, SIGMA_ENOUGH_M
+from uwbslam_jax.placement import Keyframe, Placement, Problem, largest_sigma, rotation
 from uwbslam_jax.slam import Estimate, State
 from uwbslam_jax.tiles import TILE
 
