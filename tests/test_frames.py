@@ -130,12 +130,14 @@ def test_a_node_that_ranges_to_itself_is_dropped_and_counted():
     assert make.dropped == {"range: a node to itself": 1}
 
 
-def test_ids_beyond_max_beacons_are_dropped_and_counted():
+def test_ids_beyond_max_beacons_are_dropped_and_counted_and_told_once():
     make = assembler()
-    frames = list(make.frames([ranged(0.0, 0, 4_000_000_000), ranged(0.01, 0, 5), ranged(0.02, 0, 6), scan(0.1)]))
+    heard = [ranged(0.0, 0, 4_000_000_000), ranged(0.01, 0, 5), ranged(0.02, 0, 6), ranged(0.03, 0, 7), scan(0.1)]
+    frames = list(make.frames(heard))
     assert len(taken(frames)) == 2
     assert make.slots == {0: 0, 4_000_000_000: 1, 5: 2}
-    assert make.dropped == {"range: more beacons than max_beacons": 1}
+    assert make.dropped == {"range: more beacons than max_beacons": 2}
+    assert make.warnings == ["node 6 is ignored: more than 2 beacons, see uwb.max_beacons"]  # told once
 
 
 def test_more_ranges_than_a_frame_holds_make_more_frames_or_are_counted():

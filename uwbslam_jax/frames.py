@@ -38,12 +38,14 @@ class FrameAssembler:
     Attributes:
       slots: node id -> slot, the robot 0; filled as ids are heard.
       dropped: what was not used, by reason.
+      warnings: one line each; that there are more beacons than slots is told once.
       odometry_used: whether any frame carried an increment.
     """
 
     def __init__(self, settings: Settings, max_ranges: int):
         self.slots: dict[int, int] = {settings.robot.id: 0}
         self.dropped: Counter[str] = Counter()
+        self.warnings: list[str] = []
         self.odometry_used = False
         self._settings = settings
         self._max_ranges = max_ranges
@@ -134,7 +136,10 @@ class FrameAssembler:
 
     def _slot(self, node: int) -> int | None:
         if node not in self.slots:
-            if len(self.slots) > self._settings.uwb.max_beacons:
+            most = self._settings.uwb.max_beacons
+            if len(self.slots) > most:
+                if not self.warnings:
+                    self.warnings.append(f"node {node} is ignored: more than {most} beacons, see uwb.max_beacons")
                 return None
             self.slots[node] = len(self.slots)
         return self.slots[node]

@@ -115,8 +115,13 @@ class Runner:
     def result(self, facts: Facts) -> Result:
         """The Result so far; odometry, step times and the drops of the frames are added to the facts."""
         dropped = facts.dropped + self._assembler.dropped
+        warnings = [*facts.warnings, *self._assembler.warnings]
         told = dataclasses.replace(
-            facts, dropped=dropped, odometry_used=self._assembler.odometry_used, step_ms=self._step_ms
+            facts,
+            warnings=warnings,
+            dropped=dropped,
+            odometry_used=self._assembler.odometry_used,
+            step_ms=self._step_ms,
         )
         return to_result(self.session, told)
 
