@@ -1,0 +1,4 @@
+"""Drivers: bytes of LiDARs and UWB radios become host messages. `open_source` opens a device by its URL."""
+
+from uwbslam_drivers.source import Source as Source
+from uwbslam_drivers.source import open_source as open_source

@@ -1,0 +1,96 @@
+"""Qorvo DWM1001 modules in shell mode: the lines of `lec`, DIST,n,ANi,ID,x,y,z,distance,...,POS,x,y,z,quality.
+
+The surveyed positions that they carry are not used. The lines tell neither time nor power (DWM1001 firmware API guide,
+section 4, shell commands), nor the id of the module that is connected: that is the option `id`.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import Counter
+from collections.abc import Mapping
+
+from uwbslam_drivers.device import DeviceFailure, Measured, Option, Port, Session
+from uwbslam_drivers.lines import Lines
+from uwbslam_jax.measurements import RangeMessage
+
+_LISTEN = 0.6  # a module that sends already does so several times a second [s]
+_ANSWER = 1.5
+
+
+class Dwm1001Decoder:
+    """Lines to ranges from the module that is connected; stamped with their arrival."""
+
+    def __init__(self, own: int, dropped: Counter[str]):
+        """own: node id of the module that is connected."""
+        self._own = own
+        self._dropped = dropped
+        self._lines = Lines(dropped)
+
+    def feed(self, data: bytes, received: int) -> list[Measured]:
+        """Ranges of the lines that these bytes complete."""
+        found: list[Measured] = []
+        for line in self._lines.feed(data):
+            begin = line.rfind(b"DIST,")
+            if begin >= 0:
+                ranges = parse(line[begin:])
+                if ranges is None:
+                    self._dropped["line: damaged"] += 1
+                for target, metres in ranges or []:
+                    found.append(Measured(RangeMessage(received, self._own, target, metres), None))
+        return found
+
+
+def parse(line: bytes) -> list[tuple[int, float]] | None:
+    """Id and distance [m] of each anchor of a DIST line; None where its fields are not as they should be."""
+    try:
+        words = line.decode("ascii").split(",")
+        count = int(words[1])
+        rest = words[2 + 6 * count :]
+        if not 0 <= count <= 64 or len(words) < 2 + 6 * count or rest[:1] not in ([], ["POS"]):
+            return None
+        found = []
+        for k in range(count):
+            name, node, *_, distance = words[2 + 6 * k : 8 + 6 * k]
+            metres = float(distance)
+            if name != f"AN{k}" or len(node) != 4 or not math.isfinite(metres):
+                return None
+            found.append((int(node, 16), metres))
+        return found
+    except (ValueError, IndexError):
+        return None
+
+
+class Dwm1001:
+    """Enters the shell with two Returns and starts `lec`, unless the module sends lines already."""
+
+    kind = "uwb"
+    baud = 115200
+    dtr = True
+    tcp_port = None
+    silence = 5.0
+    options: Mapping[str, Option] = {"id": Option("0", r"\d{1,9}", "a whole number")}
+
+    def start(self, port: Port, options: Mapping[str, str], dropped: Counter[str]) -> Session:
+        session = Session(Dwm1001Decoder(int(options["id"]), dropped))
+        # A second `lec` would end the first, and Return in the shell repeats the last command: listen before.
+        if _hears(port, b"DIST", _LISTEN):
+            return session
+        port.write(b"\r")
+        time.sleep(0.1)
+        port.write(b"\r")
+        if not _hears(port, b"dwm>", _ANSWER) and not _hears(port, b"DIST", _LISTEN):
+            raise DeviceFailure("no shell: not a DWM1001 in UART shell mode")
+        port.write(b"lec\r")
+        return session
+
+
+def _hears(port: Port, word: bytes, timeout: float) -> bool:
+    heard = b""
+    until = time.monotonic() + timeout
+    while (left := until - time.monotonic()) > 0.0:
+        heard = (heard + port.read(left))[-4096:]
+        if word in heard:
+            return True
+    return False

@@ -1,0 +1,1 @@
+"""Emulators: the sensors of a simulated robot, speaking their devices' protocols over real ports, with faults."""

@@ -1,0 +1,99 @@
+"""Nooploop LinkTrack, NodeFrame2 (55 04) and NodeFrame3 (55 05) of the NLink protocol.
+
+Little-endian; a frame ends with the sum of its bytes. Distances are 24-bit millimetres, powers minus half a byte in
+dBm (NLink protocol, LinkTrack user manual V2). NodeFrame2 tells the time of each range, NodeFrame3 one for all.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import Counter
+from collections.abc import Mapping
+
+from uwbslam_drivers.device import Measured, Option, Port, Session
+from uwbslam_jax.measurements import RangeMessage
+
+MS = 1_000_000
+WRAP = (1 << 32) * MS
+"""Period of the system time [ns]."""
+FRAME2, FRAME3 = b"\x55\x04", b"\x55\x05"
+FIXED2, FIXED3 = 119, 21
+"""Bytes before the nodes."""
+NODE2, NODE3 = struct.Struct("<BB3sBBI2x"), struct.Struct("<BB3sBB")
+LONGEST = FIXED2 + 255 * NODE2.size + 1
+
+
+class LinkTrackDecoder:
+    """Frames to ranges from the node that is connected to every node that it hears."""
+
+    def __init__(self, dropped: Counter[str]):
+        self._dropped = dropped
+        self._buffer = b""
+
+    def feed(self, data: bytes, received: int) -> list[Measured]:
+        """Ranges of the frames that these bytes complete."""
+        buffer, at = self._buffer + data, 0
+        found: list[Measured] = []
+        while (at := _begin(buffer, at)) + FIXED3 < len(buffer):
+            length = _frame_length(buffer, at)
+            if length is None:
+                at += 1
+            elif len(buffer) - at < length:
+                break
+            elif sum(buffer[at : at + length - 1]) & 0xFF != buffer[at + length - 1]:
+                self._dropped["frame: wrong sum"] += 1
+                at += 1
+            else:
+                found += _ranges(buffer[at : at + length])
+                at += length
+        self._buffer = buffer[at:]
+        return found
+
+
+def _begin(buffer: bytes, at: int) -> int:
+    """Where the next frame may begin; the end, or a last lone 55, where none does."""
+    marks = [k for k in (buffer.find(FRAME2, at), buffer.find(FRAME3, at)) if k >= 0]
+    if marks:
+        return min(marks)
+    return len(buffer) - 1 if buffer.endswith(b"\x55") and len(buffer) > at else len(buffer)
+
+
+def _frame_length(buffer: bytes, at: int) -> int | None:
+    """Length that the frame tells of itself, None where it is impossible or contradicts its number of nodes."""
+    fixed, size = (FIXED2, NODE2.size) if buffer[at + 1] == FRAME2[1] else (FIXED3, NODE3.size)
+    length = buffer[at + 2] | buffer[at + 3] << 8
+    count, rest = divmod(length - fixed - 1, size)
+    if rest or not 0 <= count <= 255:
+        return None
+    told = at + fixed - 1
+    return length if told >= len(buffer) or buffer[told] == count else None
+
+
+def _ranges(frame: bytes) -> list[Measured]:
+    second = frame[1] == FRAME2[1]
+    fixed, node = (FIXED2, NODE2) if second else (FIXED3, NODE3)
+    role, own = frame[4], frame[5]
+    found = []
+    for fields in node.iter_unpack(frame[fixed:-1]):
+        its_role, its_id, distance, first_path, receive = fields[:5]
+        system = fields[5] if second else int.from_bytes(frame[10:14], "little")
+        # Tags and anchors count apart: one that shares the frame's own id gets role * 256 + id, as in recordings.
+        target = its_id if its_id != own or its_role == role else its_role * 256 + its_id
+        metres = int.from_bytes(distance, "little", signed=True) / 1000.0
+        message = RangeMessage(0, own, target, metres, receive / -2.0, first_path / -2.0)
+        found.append(Measured(message, system * MS))
+    return found
+
+
+class LinkTrack:
+    """Sends by itself what it was set up for (NodeFrame2 or NodeFrame3 in NAssistant)."""
+
+    kind = "uwb"
+    baud = 921600
+    dtr = True
+    tcp_port = None
+    silence = 5.0
+    options: Mapping[str, Option] = {}
+
+    def start(self, port: Port, options: Mapping[str, str], dropped: Counter[str]) -> Session:
+        return Session(LinkTrackDecoder(dropped), b"", WRAP)

@@ -1,0 +1,263 @@
+"""Slamtec RPLIDAR, standard scan (5-byte nodes) and express scan (84-byte capsules of 32 samples).
+
+After the RPLIDAR interface protocol (LR001, v2.x) and, for the angle offsets within a capsule, Slamtec's SDK
+(_capsuleToNormal). The scanner turns clockwise and has no clock: a sample's time is that of its arrival less the time
+that the samples behind it took.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from uwbslam_drivers.device import DeviceFailure, Measured, Option, Port, Session
+from uwbslam_jax.measurements import ScanMessage
+
+STOP, RESET, SCAN, EXPRESS = b"\xa5\x25", b"\xa5\x40", b"\xa5\x20", b"\xa5\x82\x05\x00\x00\x00\x00\x00\x22"
+GET_HEALTH, GET_SAMPLERATE = b"\xa5\x52", b"\xa5\x59"
+MOTOR_ON = b"\xa5\xf0\x02\x94\x02\xc1"
+"""Sets the PWM to 660 on models with an accessory board; others ignore it."""
+SCAN_HEADER, EXPRESS_HEADER = b"\xa5\x5a\x05\x00\x00\x40\x81", b"\xa5\x5a\x54\x00\x00\x40\x82"
+HEALTH_HEADER, RATE_HEADER = b"\xa5\x5a\x03\x00\x00\x00\x06", b"\xa5\x5a\x04\x00\x00\x00\x15"
+NODE, CAPSULE, SAMPLES = 5, 84, 32
+RANGE_MIN, RANGE_MAX = 0.15, 40.0
+"""Limits over all models [m]; a reading of 0 is no return."""
+SWEEP = 8192
+"""More samples than in any turn; without a new turn in so many the sweep is dropped."""
+LEAST_SAMPLES = 30
+_LOCK = 6  # so many nodes in a row have to look right before they are taken for nodes
+_ANSWER = 0.5
+
+Sample = tuple[float, float, int]
+"""Clockwise angle [deg, 0 to 360], distance [m], host time [ns]."""
+
+
+class Sweep:
+    """Samples to scans: a scan is complete when the angle begins anew."""
+
+    def __init__(self, period: float, dropped: Counter[str]):
+        """period: time between two samples [s]."""
+        self._period = period
+        self._dropped = dropped
+        self._samples: list[Sample] = []
+        self._whole = False  # the first turn is seen from somewhere on
+
+    def add(self, sample: Sample) -> list[Measured]:
+        """The scan that ends before this sample, if one does."""
+        found: list[Measured] = []
+        if self._samples and self._samples[-1][0] < 30.0 and sample[0] > 330.0:
+            return found  # a straggler of the turn before: offsets within a capsule may swap neighbours
+        if self._samples and sample[0] < self._samples[-1][0] - 180.0:
+            if self._whole:
+                found = self._close()
+            self._samples, self._whole = [], True
+        if len(self._samples) >= SWEEP:
+            self._dropped["scan: no new turn"] += 1
+            self._samples, self._whole = [], False
+        self._samples.append(sample)
+        return found
+
+    def _close(self) -> list[Measured]:
+        angle, distance = np.array([s[:2] for s in self._samples]).T
+        order = np.argsort(angle, kind="stable")
+        angle, distance = angle[order], distance[order]
+        if angle.size < LEAST_SAMPLES or angle[-1] - angle[0] < 180.0:
+            self._dropped["scan: too few samples"] += 1
+            return []
+        step = float(np.median(np.diff(angle)))
+        index = np.round((angle - angle[0]) / step) if step > 0.0 else np.arange(float(angle.size))
+        if index[-1] >= SWEEP:
+            self._dropped["scan: angles do not fit"] += 1
+            return []
+        # The motor's speed hardly changes within a turn: one straight line through all angles.
+        slope, first = np.polyfit(index, angle, 1)
+        slots = np.round((angle - first) / slope).astype(int)
+        slots -= slots[0]
+        ranges = np.full(min(slots[-1] + 1, SWEEP), np.inf, np.float32)
+        ranges[slots[slots < SWEEP]] = np.where(distance > 0.0, distance, np.inf)[slots < SWEEP]
+        begin = self._samples[0][2]
+        angles = (-math.radians(first), -math.radians(slope))
+        return [Measured(ScanMessage(begin, *angles, self._period, RANGE_MIN, RANGE_MAX, ranges), None)]
+
+
+class StandardDecoder:
+    """Nodes of 5 bytes: quality and start flag, angle [1/64 deg], distance [1/4 mm]."""
+
+    def __init__(self, period: float, dropped: Counter[str]):
+        self._sweep = Sweep(period, dropped)
+        self._period = period
+        self._dropped = dropped
+        self._buffer = b""
+        self._locked = False
+        self._angle = 0.0
+
+    def feed(self, data: bytes, received: int) -> list[Measured]:
+        """Scans that end among these bytes."""
+        buffer, at = self._buffer + data, 0
+        found: list[Measured] = []
+        while len(buffer) - at >= (NODE if self._locked else NODE * _LOCK):
+            node = _node(buffer, at)
+            if self._locked and node is not None and _ahead(self._angle, node[0]):
+                self._angle = node[0]
+                behind = (len(buffer) - at - NODE) / NODE * self._period
+                found += self._sweep.add((*node, received - round(behind * 1e9)))
+                at += NODE
+            elif not self._locked and _nodes(buffer, at):
+                self._locked, self._angle = True, _node(buffer, at)[0]  # type: ignore[index]
+            else:
+                self._locked = False
+                self._dropped["node: bytes skipped"] += 1
+                at += 1
+        self._buffer = buffer[at:]
+        return found
+
+
+def _node(buffer: bytes, at: int) -> tuple[float, float] | None:
+    """Angle [deg] and distance [m] of the node there; None where its check bits are wrong."""
+    flags, low = buffer[at], buffer[at + 1]
+    if (flags & 1) == (flags >> 1 & 1) or not low & 1:
+        return None
+    angle = (low >> 1 | buffer[at + 2] << 7) / 64.0
+    distance = (buffer[at + 3] | buffer[at + 4] << 8) / 4000.0
+    return (angle % 360.0, distance) if angle < 370.0 else None
+
+
+def _ahead(last: float, angle: float) -> bool:
+    """Whether an angle follows the last one: at most a little back and not far ahead [deg]."""
+    return (angle - last + 5.0) % 360.0 < 30.0
+
+
+def _nodes(buffer: bytes, at: int) -> bool:
+    """Whether what begins there looks like nodes."""
+    angles = []
+    for k in range(_LOCK):
+        node = _node(buffer, at + k * NODE)
+        if node is None or (angles and not _ahead(angles[-1], node[0])):
+            return False
+        angles.append(node[0])
+    return True
+
+
+class ExpressDecoder:
+    """Capsules of 84 bytes: start angle, 16 cabins of two samples each, XOR check."""
+
+    def __init__(self, period: float, dropped: Counter[str]):
+        self._sweep = Sweep(period, dropped)
+        self._period = period
+        self._dropped = dropped
+        self._buffer = b""
+        self._capsule: tuple[bytes, int] | None = None  # waits for the angle at which the next begins
+        self._turned = 0.0
+
+    def feed(self, data: bytes, received: int) -> list[Measured]:
+        """Scans that end among these bytes."""
+        buffer, at = self._buffer + data, 0
+        found: list[Measured] = []
+        while len(buffer) - at >= CAPSULE:
+            capsule = buffer[at : at + CAPSULE]
+            if not _capsule_intact(capsule):
+                self._dropped["capsule: bytes skipped"] += 1
+                found += self._expand(None)
+                at += 1
+                continue
+            behind = (len(buffer) - at - CAPSULE) / CAPSULE * SAMPLES * self._period
+            found += self._expand(capsule)
+            self._capsule = capsule, received - round(behind * 1e9)
+            at += CAPSULE
+        self._buffer = buffer[at:]
+        return found
+
+    def _expand(self, following: bytes | None) -> list[Measured]:
+        """Adds the samples of the waiting capsule; if the next one is lost, the turn is taken from the one before."""
+        if self._capsule is None:
+            return []
+        capsule, received = self._capsule
+        self._capsule = None
+        start = _start_angle(capsule)
+        if following is not None:
+            self._turned = (_start_angle(following) - start) % 360.0
+        if not 0.0 < self._turned < 180.0:
+            return []
+        cabins = np.frombuffer(capsule, np.uint8, offset=4).reshape(16, NODE).astype(int)
+        word = np.stack([cabins[:, 0] | cabins[:, 1] << 8, cabins[:, 2] | cabins[:, 3] << 8], -1)
+        offset = np.stack([cabins[:, 4] & 0xF, cabins[:, 4] >> 4], -1) | (word & 3) << 4
+        distance = ((word & 0xFFFC) / 4000.0).ravel()
+        angle = (start + self._turned / SAMPLES * np.arange(SAMPLES) - offset.ravel() / 8.0) % 360.0
+        age = (SAMPLES - 1 - np.arange(SAMPLES)) * self._period
+        times = received - np.round(age * 1e9).astype(np.int64)
+        found: list[Measured] = []
+        for sample in zip(angle.tolist(), distance.tolist(), times.tolist(), strict=True):
+            found += self._sweep.add(sample)
+        return found
+
+
+def _capsule_intact(capsule: bytes) -> bool:
+    if capsule[0] >> 4 != 0xA or capsule[1] >> 4 != 0x5:
+        return False
+    return (capsule[0] & 0xF | (capsule[1] & 0xF) << 4) == xor(capsule[2:])
+
+
+def _start_angle(capsule: bytes) -> float:
+    """Clockwise angle of a capsule's first sample [deg]; the top bit only says that scanning has begun."""
+    return ((capsule[2] | capsule[3] << 8) & 0x7FFF) / 64.0
+
+
+def xor(data: bytes) -> int:
+    """Exclusive or of all bytes."""
+    return int(np.bitwise_xor.reduce(np.frombuffer(data, np.uint8)))
+
+
+class Rplidar:
+    """Stops the scanner, asks for its health and sample times, starts the motor and the scan."""
+
+    kind = "lidar"
+    baud = 115200
+    dtr = False  # set, it stops the motor of an A1
+    tcp_port = 20108
+    silence = 4.0  # the motor takes a while
+    options: Mapping[str, Option] = {"mode": Option("express", "standard|express", "standard or express")}
+
+    def start(self, port: Port, options: Mapping[str, str], dropped: Counter[str]) -> Session:
+        mode = options["mode"]
+        port.write(STOP)
+        _drain(port, 0.1)
+        health, _ = _answer(port, GET_HEALTH, HEALTH_HEADER, 3)
+        if health[0] == 2:
+            port.write(RESET)
+            raise DeviceFailure(f"the scanner reports error {health[1] | health[2] << 8} and is reset")
+        rates, _ = _answer(port, GET_SAMPLERATE, RATE_HEADER, 4)
+        port.write(MOTOR_ON)
+        make: Callable[[float, Counter[str]], StandardDecoder | ExpressDecoder]
+        if mode == "standard":
+            make, request, header, duration = StandardDecoder, SCAN, SCAN_HEADER, rates[0] | rates[1] << 8
+        else:
+            make, request, header, duration = ExpressDecoder, EXPRESS, EXPRESS_HEADER, rates[2] | rates[3] << 8
+        if not duration:
+            raise DeviceFailure(f"the scanner has no {mode} scan")
+        _, leftover = _answer(port, request, header, 0)
+        return Session(make(duration / 1e6, dropped), leftover)
+
+
+def _answer(port: Port, request: bytes, header: bytes, length: int) -> tuple[bytes, bytes]:
+    """Answer of a length after its header, and what came behind it."""
+    for _ in range(5):
+        port.write(request)
+        heard = b""
+        until = time.monotonic() + _ANSWER
+        while (left := until - time.monotonic()) > 0.0:
+            heard = (heard + port.read(left))[-65536:]
+            at = heard.find(header)
+            if at >= 0 and len(heard) >= (end := at + len(header) + length):
+                return heard[at + len(header) : end], heard[end:]
+    raise DeviceFailure("no answer: not an RPLIDAR, or another baud rate (115200 or 256000)")
+
+
+def _drain(port: Port, quiet: float) -> None:
+    """Reads until nothing comes for a while [s]."""
+    until = time.monotonic() + 2.0
+    while port.read(quiet) and time.monotonic() < until:
+        pass
