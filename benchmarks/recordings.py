@@ -1,17 +1,16 @@
 """How far off the answer is on recordings with known truth, with the defaults, with and without their odometry.
 
-`python -m benchmarks.recordings FOLDER` runs every NAME.mcap below FOLDER that has a NAME.truth.npz beside it and
-writes results/recordings.md and .json.
+`python -m benchmarks.recordings FOLDER` runs every NAME.mcap below FOLDER that has a NAME.truth.npz beside it, and the
+public logs without LiDAR that lie in FOLDER, and writes results/recordings.md and .json.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 from pathlib import Path
 
-from benchmarks.scenarios import RESULTS, line, provenance
+from benchmarks.tables import cell, line, provenance, write
 from uwbslam_jax.__main__ import prepare
 
 _COLUMNS = {
@@ -20,6 +19,8 @@ _COLUMNS = {
     "heading_deg_median": ("heading median [deg]", 2),
     "beacon_mean_m": ("beacons mean [m]", 3),
     "beacon_max_m": ("beacons max [m]", 3),
+    "scan_misfit": ("mean 1 - Gamma", 3),
+    "pose_nees_ratio": ("pose NEES / dof", 2),
     "covered": ("covered", 3),
     "decided_at": ("decided at [s]", 1),
     "real_time_factor": ("real-time factor", 0),
@@ -28,15 +29,25 @@ _COLUMNS = {
 
 def measure(log: Path, *, odometry: bool) -> dict[str, float | None]:
     """Figures of one run of a recording."""
+    from benchmarks.sharpness import scan_misfit
     from uwbslam_jax.config import OdomSettings, Settings
-    from uwbslam_jax.metrics import Truth, evaluate
+    from uwbslam_jax.mcap_log import LogReader
+    from uwbslam_jax.measurements import ScanMessage
+    from uwbslam_jax.metrics import Truth, consistency, evaluate
     from uwbslam_jax.run import run_log
 
     settings = dataclasses.replace(Settings(), odom=OdomSettings(use=odometry))
     result, _ = run_log(log, settings)
     beacons = {beacon.id: beacon.position for beacon in result.beacons}
-    figures = evaluate(result.stamps, result.poses, beacons, Truth.load(log.with_suffix(".truth.npz")))
-    return {key: {**figures, **result.summary}[key] for key in _COLUMNS}
+    truth = Truth.load(log.with_suffix(".truth.npz"))
+    figures = evaluate(result.stamps, result.poses, beacons, truth) | consistency(result, truth)
+    lidar = settings.lidar
+    reader = LogReader(log, scan_topic=lidar.topic, uwb_topic=None, odom_topic=None)
+    scans = (message for message in reader if isinstance(message, ScanMessage))
+    limits = (lidar.min_range, lidar.max_range)
+    misfit = scan_misfit(result.map, result.stamps, result.poses, scans, settings.robot.lidar, limits)
+    found = {**figures, "scan_misfit": misfit, **result.summary}
+    return {key: found[key] for key in _COLUMNS}
 
 
 def main() -> None:
@@ -44,7 +55,8 @@ def main() -> None:
     prepare()  # before JAX is imported, which reads it once
     parser = argparse.ArgumentParser(prog="python -m benchmarks.recordings", description=__doc__)
     parser.add_argument("folder", type=Path)
-    logs = [log for log in sorted(parser.parse_args().folder.rglob("*.mcap")) if log.with_suffix(".truth.npz").exists()]
+    folder = parser.parse_args().folder
+    logs = [log for log in sorted(folder.rglob("*.mcap")) if log.with_suffix(".truth.npz").exists()]
     facts = provenance(workers=1)
     rows = [
         {"recording": log.stem, "odometry": odometry, **measure(log, odometry=odometry)}
@@ -58,18 +70,23 @@ def main() -> None:
     ]
     lines += [
         "",
-        "`intel`: real LiDAR scans; UWB ranges and odometry drawn on the reference poses (semi-synthetic).",
+        "`intel`: real LiDAR scans; UWB ranges and odometry drawn on the reference poses (semi-synthetic). Mean "
+        "1 - Gamma: of all returns of all scans against the final map.",
         "",
     ]
+    if not logs:
+        lines += ["No recording with LiDAR and truth in the folder: skipped.", ""]
     lines += [line(["recording", "odometry", *(label for label, _ in _COLUMNS.values())])]
     lines += [line(["---", "---", *["---:"] * len(_COLUMNS)])]
     for row in rows:
-        cells = ["-" if row[k] is None else f"{row[k]:.{digits}f}" for k, (_, digits) in _COLUMNS.items()]
+        cells = [cell(row[key], digits) for key, (_, digits) in _COLUMNS.items()]
         lines.append(line([str(row["recording"]), "used" if row["odometry"] else "left out", *cells]))
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "recordings.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    text = json.dumps({"provenance": facts, "rows": rows}, indent=1)
-    (RESULTS / "recordings.json").write_text(text + "\n", encoding="utf-8")
+    from benchmarks import without_lidar
+
+    driven, rest = list(without_lidar.driven_rows(folder)), list(without_lidar.rest_rows(folder))
+    lines += without_lidar.tables(driven, rest)
+    data = {"provenance": facts, "rows": rows, "without_lidar": driven, "at_rest": rest}
+    write("recordings", "\n".join(lines) + "\n", data)
     print("\n".join(lines))
 
 

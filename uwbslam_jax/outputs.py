@@ -97,15 +97,19 @@ def trinary(log_odds: np.ndarray) -> np.ndarray:
 
 
 def write_map(image: MapImage, directory: Path) -> None:
-    """map.pgm and map.yaml as map_server reads them, cropped to the observed area; the top row is the largest y."""
+    """map.pgm and map.yaml as map_server reads them, cropped to the observed area; the top row is the largest y.
+
+    A map of which nothing was observed is a single unknown cell, and map.yaml says so.
+    """
     image = crop(image)
+    note = "" if image.log_odds.any() else "# nothing was observed: no scan was drawn\n"
     gray = trinary(image.log_odds)[::-1]
     rows, columns = gray.shape
     head = f"P5\n# {image.resolution:g} m/cell\n{columns} {rows}\n255\n"
     (directory / "map.pgm").write_bytes(head.encode("ascii") + gray.tobytes())
     x, y = (float(value) for value in image.origin)
     (directory / "map.yaml").write_text(
-        "image: map.pgm\n"
+        f"{note}image: map.pgm\n"
         "mode: trinary\n"
         f"resolution: {float(image.resolution):.6g}\n"
         f"origin: [{x:.6f}, {y:.6f}, 0.0]\n"

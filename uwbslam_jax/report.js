@@ -14,7 +14,7 @@ const onTime = []; // called whenever the time shown changes
 function readColours() {
   const style = getComputedStyle(document.documentElement);
   for (const name of ["ink", "muted", "line", "card", "accent", "second", "free", "occupied", "unknown", "scan",
-    "static", "moving", "silent", "dropped"]) css[name] = style.getPropertyValue(`--${name}`).trim();
+    "static", "moving", "silent", "dropped", "relative"]) css[name] = style.getPropertyValue(`--${name}`).trim();
   ramp = style.getPropertyValue("--ramp").split(",").map((c) => rgb(c.trim()));
 }
 function rgb(hex) { return [1, 3, 5].map((k) => parseInt(hex.slice(k, k + 2), 16)); }

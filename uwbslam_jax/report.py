@@ -44,9 +44,7 @@ _FIGURES: dict[str, tuple[str, str, int]] = {
     "covered": ("Share of the time covered", "", 3),
     "decided_at": ("Frame decided at", "s", 1),
     "beacons_missing": ("Beacons missing", "", 0),
-    "pose_nees": ("Pose NEES", "", 2),
     "pose_nees_ratio": ("Pose NEES / dof", "", 2),
-    "beacon_nees": ("Beacon NEES", "", 2),
     "beacon_nees_ratio": ("Beacon NEES / dof", "", 2),
 }
 _UNITS = ("m", "s", "ms", "deg", "rad", "Hz")  # as the last part of a figure's name
@@ -238,7 +236,7 @@ def _section(title: str, body: str) -> str:
 
 
 def _legend(beacons: Sequence[BeaconEstimate]) -> str:
-    present = [s for s in ("static", "moving", "silent", "dropped") if any(b.status == s for b in beacons)]
+    present = [s for s in ("static", "moving", "silent", "dropped", "relative") if any(b.status == s for b in beacons)]
     return "".join(f'<span><i style="background: var(--{s})"></i>beacon, {s}</span>' for s in present)
 
 

@@ -16,7 +16,8 @@ class BeaconEstimate:
       id: the node's id.
       position: (2,) [m].
       cov: (2, 2) [m^2].
-      status: "static", "moving", "silent" or "dropped".
+      status: "static", "moving", "silent" or "dropped"; "relative" while the robot has not moved and only the geometry
+        among the nodes is known, in a frame of its own.
     """
 
     id: int
@@ -42,7 +43,8 @@ class MapImage:
 
 @dataclass(slots=True)
 class Result:
-    """Everything a run found. T frames from the first scan on, all poses in the published frame.
+    """Everything a run found. T frames from the first scan on (from the first odometry where there is no scan), all
+    poses in the published frame.
 
     Attributes:
       stamps: (T,) int64 [ns].

@@ -7,25 +7,22 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import resource
 import time
-from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
 import jax
-import numpy as np
 
-from uwbslam_jax import __version__
+from uwbslam_jax import relative
 from uwbslam_jax.config import Settings
+from uwbslam_jax.findings import Facts, to_result
 from uwbslam_jax.frames import FrameAssembler
 from uwbslam_jax.mcap_log import LogError, LogReader
 from uwbslam_jax.measurements import Message, ScanMessage, StampedFrame, TruthMessage
 from uwbslam_jax.metrics import Truth
-from uwbslam_jax.result import BeaconEstimate, Result
+from uwbslam_jax.relative import Links, Relative
+from uwbslam_jax.result import Result
 from uwbslam_jax.session import CONTROL_EVERY, Session
 from uwbslam_jax.slam import Estimate
 
@@ -59,28 +56,6 @@ class CompileClock:
         jax.monitoring.unregister_event_duration_listener(self._listen)
 
 
-@dataclass
-class Facts:
-    """What the Result tells besides what the session knows.
-
-    Attributes:
-      warnings: one line each.
-      dropped: measurements left out, by reason.
-      truncated: where the recording breaks, None where it does not.
-      odometry_used: whether any frame carried an increment.
-      wall_s, compile_s: time taken, and how much of it JAX compiled [s].
-      step_ms: one a frame [ms], without compilation.
-    """
-
-    warnings: list[str] = field(default_factory=list)
-    dropped: Counter[str] = field(default_factory=Counter)
-    truncated: str | None = None
-    odometry_used: bool = False
-    wall_s: float = 0.0
-    compile_s: float = 0.0
-    step_ms: list[float] = field(default_factory=list)
-
-
 class Runner:
     """Messages in, a Result out. Truth is set aside: the estimator never sees it.
 
@@ -97,6 +72,7 @@ class Runner:
         self._clock = clock
         self._waiting: list[StampedFrame] = []
         self._step_ms: list[float] = []
+        self._links = Links()
 
     def add(self, message: Message) -> list[Estimate]:
         """The estimates that a message leads to; in batch mode they come in groups."""
@@ -113,7 +89,10 @@ class Runner:
         return estimates
 
     def result(self, facts: Facts) -> Result:
-        """The Result so far; odometry, step times and the drops of the frames are added to the facts."""
+        """The Result so far; odometry, step times and the drops of the frames are added to the facts.
+
+        While the robot waits for motion the beacons are those of the relative geometry, status "relative".
+        """
         dropped = facts.dropped + self._assembler.dropped
         warnings = [*facts.warnings, *self._assembler.warnings]
         told = dataclasses.replace(
@@ -122,8 +101,18 @@ class Runner:
             dropped=dropped,
             odometry_used=self._assembler.odometry_used,
             step_ms=self._step_ms,
+            relative=self.relative(),
         )
         return to_result(self.session, told)
+
+    def relative(self) -> Relative | None:
+        """Geometry of the nodes among themselves while the robot rests; None where the ranges do not fix one."""
+        if self.session.decided_at is not None or self.session.status != "waiting for motion":
+            return None
+        settings = self.session.settings
+        return relative.solve(
+            self._links.averages(), self._links.rise, origin=settings.robot.id, fit_offset=settings.uwb.fit_offset
+        )
 
     def truth(self) -> Truth | None:
         """The ground truth so far, None where there is none of the robot."""
@@ -142,6 +131,9 @@ class Runner:
         estimates = [self.session.step(frames[0])] if self._group == 1 else self.session.steps(frames)
         seconds = time.perf_counter() - begin - (self._clock.seconds - compiled)
         self._step_ms += [max(seconds, 0.0) * 1e3 / len(frames)] * len(frames)
+        if self.session.status == "waiting for motion":
+            for frame in frames:
+                self._links.hear(frame, self.session.params, self.session.config.nlos_gap_db)
         return estimates
 
 
@@ -163,7 +155,8 @@ def run_log(
       What the estimator found, and the ground truth where the recording has some.
 
     Raises:
-      LogError: the recording cannot be read, or holds no usable scan.
+      LogError: the recording cannot be read, or holds no usable scan, no odometry and no ranges between nodes at
+        rest that fix a geometry.
     """
     begin = time.perf_counter()
     reader = LogReader(
@@ -184,14 +177,18 @@ def run_log(
             if progress is not None and count % _PROGRESS_EVERY == 0:
                 progress(count, reader.message_count)
         runner.finish()
-        if not any(runner.session.history.has_scan):
-            why = f"; {reader.truncated}" if reader.truncated else ""
-            raise LogError(f"{reader.path}: no usable scan on {settings.lidar.topic}{why}")
         facts = Facts(list(reader.warnings), reader.dropped, reader.truncated, compile_s=clock.seconds)
         facts.wall_s = time.perf_counter() - begin
+    result = runner.result(facts)
+    if not len(result.stamps) and not result.beacons:
+        why = f"; {reader.truncated}" if reader.truncated else ""
+        raise LogError(
+            f"{reader.path}: no usable scan on {settings.lidar.topic}, no odometry on {settings.odom.topic}, and no "
+            f"ranges that fix a geometry on {settings.uwb.topic}{why}"
+        )
     if progress is not None:
         progress(reader.message_count, reader.message_count)
-    return runner.result(facts), runner.truth()
+    return result, runner.truth()
 
 
 def run_messages(
@@ -212,120 +209,11 @@ def run_messages(
 def fit_beams(settings: Settings, messages: Iterable[Message]) -> Settings:
     """Settings with no more slots for beams than the first scans need: a step's cost grows with them.
 
-    Where the scans differ in size there is room for larger ones; what still does not fit is thinned.
+    Where the scans differ in size there is room for larger ones; what still does not fit is thinned. Without any scan
+    the least will do.
     """
     scans = (m.ranges.size for m in messages if isinstance(m, ScanMessage) and m.ranges.size > 1)
     sizes = list(itertools.islice(scans, _PEEK_SCANS))
-    if not sizes:
-        return settings
-    beams = max(sizes) if len(set(sizes)) == 1 else round(max(sizes) * _VARYING_BEAMS)
+    beams = max(sizes, default=2) if len(set(sizes)) <= 1 else round(max(sizes) * _VARYING_BEAMS)
     beams = min(beams, settings.lidar.max_beams)
     return dataclasses.replace(settings, lidar=dataclasses.replace(settings.lidar, max_beams=beams))
-
-
-def to_result(session: Session, facts: Facts) -> Result:
-    """What a session reported, with node ids for slots. Poses of the frames that had a scan.
-
-    A run whose frame was never decided has its poses and map in the frame that the robot started in.
-    """
-    history = session.history
-    at = np.flatnonzero(history.has_scan)
-    stamps = np.array(history.stamps, np.int64)[at]
-    start = int(stamps[0]) if len(stamps) else 0
-    ids = {slot: node for node, slot in session.slots.items()}
-    residuals = [((t - start) / 1e9, ids[i], ids[j], r) for t, i, j, r in history.residuals]
-    tracks: dict[int, list[tuple[float, float, float, float]]] = {}
-    for t, slot, x, y, sigma in history.tracks:
-        tracks.setdefault(ids[slot], []).append(((t - start) / 1e9, x, y, sigma))
-    diagnostics = {name: np.array(values)[at] for name, values in history.diagnostics.items()}
-    if len(facts.step_ms) == len(history.stamps):
-        diagnostics["step_ms"] = np.array(facts.step_ms, float)[at]
-    return Result(
-        stamps=stamps,
-        poses=np.array(history.poses, float).reshape(-1, 3)[at],
-        pose_covs=np.array(history.covs, float).reshape(-1, 3, 3)[at],
-        beacons=_beacons(session, ids),
-        beacon_tracks={node: np.array(rows, float) for node, rows in tracks.items()},
-        map=session.tiles.image(session.state.grid),
-        range_residuals=np.array(residuals, float).reshape(-1, 4),
-        scan_points=_scan_points(session),
-        diagnostics=diagnostics,
-        events=list(history.events),
-        summary=_summary(session, facts),
-    )
-
-
-def _beacons(session: Session, ids: dict[int, int]) -> list[BeaconEstimate]:
-    """Beacons in the state as they are in it now, those that left it as they were last reported."""
-    active = np.asarray(session.state.active)
-    mean, cov = np.asarray(session.state.belief.mean, float), np.asarray(session.state.belief.cov, float)
-    found = []
-    for slot in range(1, len(active)):
-        status = session.beacon_status(slot)
-        if active[slot]:
-            two = slice(2 * slot, 2 * slot + 2)
-            found.append(BeaconEstimate(ids[slot], mean[two], cov[two, two], status))
-        elif slot in session.history.beacons:
-            position, block = session.history.beacons[slot]
-            left = status if status in ("moving", "silent") else "dropped"
-            found.append(BeaconEstimate(ids[slot], position.astype(float), block.astype(float), left))
-    return sorted(found, key=lambda beacon: beacon.id)
-
-
-def _scan_points(session: Session) -> np.ndarray:
-    """(n, 2) the last scan in the published frame, each beam at its own time [m]."""
-    if session.history.last_scan is None:
-        return np.zeros((0, 2))
-    number, frame, estimate = session.history.last_scan
-    scan, lidar = frame.frame.scan, session.settings.robot.lidar
-    beam = np.flatnonzero(scan.valid)
-    bearing = float(scan.angle_min) + float(scan.angle_increment) * beam + lidar[2]
-    reach, age = np.asarray(scan.ranges, float)[beam], float(scan.time_increment) * beam
-    x, y = lidar[0] + reach * np.cos(bearing), lidar[1] + reach * np.sin(bearing)
-    # the estimate may be older than the published frame: its velocity counts relative to its own heading
-    pose, velocity = session.history.poses[number], np.asarray(estimate.velocity, float)
-    turned = pose[2] - float(estimate.pose[2])
-    c, s = np.cos(turned), np.sin(turned)
-    drift = np.array([c * velocity[0] - s * velocity[1], s * velocity[0] + c * velocity[1]])
-    heading = pose[2] + float(estimate.yaw_rate) * age
-    c, s = np.cos(heading), np.sin(heading)
-    return pose[:2] + np.stack([c * x - s * y, s * x + c * y], axis=-1) + age[:, None] * drift
-
-
-def _summary(session: Session, facts: Facts) -> dict[str, Any]:
-    """The content of summary.json, see DESIGN; without evaluation figures.
-
-    The real-time factor is the recording's duration over the time taken, compilation left out.
-    """
-    history = session.history
-    stamps, step_ms = history.stamps, facts.step_ms
-    duration = (stamps[-1] - stamps[0]) / 1e9 if stamps else 0.0
-    decided = None if session.decided_at is None else (session.decided_at - stamps[0]) / 1e9
-    total = {name: int(np.sum(values)) for name, values in history.diagnostics.items()}
-    rejected = {"not in line of sight": total.get("ranges_nlos", 0), "doubted": total.get("ranges_doubted", 0)}
-    used = total.get("ranges_used", 0)
-    rejected["node not placed"] = total.get("ranges", 0) - used - sum(rejected.values())
-    return {
-        "steps": len(stamps),
-        "duration_s": duration,
-        "wall_s": facts.wall_s,
-        "compile_s": facts.compile_s,
-        "step_ms_median": float(np.median(step_ms)) if step_ms else None,
-        "step_ms_p95": float(np.percentile(step_ms, 95)) if step_ms else None,
-        "real_time_factor": duration / max(facts.wall_s - facts.compile_s, 1e-9),
-        "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,  # kB on Linux
-        "decided_at": decided,
-        "hypotheses": session.hypotheses,
-        "status": session.status,
-        "ids": sorted(node for node, slot in session.slots.items() if slot > 0),
-        "odometry_used": facts.odometry_used,
-        "poor_matches": total.get("poor_match", 0),
-        "searches": total.get("searched", 0),
-        "ranges_used": used,
-        "ranges_rejected": rejected,
-        "dropped": dict(sorted(facts.dropped.items())),
-        "truncated": facts.truncated,
-        "warnings": facts.warnings,
-        "version": __version__,
-        "config": dataclasses.asdict(session.settings),
-    }
