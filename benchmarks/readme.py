@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-RESULTS = Path(__file__).parent / "results"
+from benchmarks.tables import RESULTS
+
 README = Path(__file__).parents[1] / "README.md"
 _BEGIN, _END = "<!-- results -->\n", "<!-- /results -->"
 
@@ -19,10 +20,14 @@ def with_tables(readme: str, tables: list[str]) -> str:
     return head + _BEGIN + "\n".join(table.strip() + "\n" for table in tables) + _END + tail
 
 
+def section(table: str) -> str:
+    """A table one headline below the README's sections, without the details that only its own file has."""
+    return "##" + table.split("\n<details>")[0]
+
+
 def main() -> None:
     """Rewrite the README in place."""
-    # a table's own headline is one below the README's sections
-    tables = ["##" + path.read_text(encoding="utf-8") for path in sorted(RESULTS.glob("*.md"))]
+    tables = [section(path.read_text(encoding="utf-8")) for path in sorted(RESULTS.glob("*.md"))]
     README.write_text(with_tables(README.read_text(encoding="utf-8"), tables), encoding="utf-8")
 
 

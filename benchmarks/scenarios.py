@@ -1,213 +1,172 @@
-"""How far off the answer is in the simulated scenarios: each seed has its own world, beacons and orientation.
+"""How far off the answer is in the simulated scenarios, against the bar of each, with the defaults.
 
-`python -m benchmarks.scenarios hall --seeds 10` writes results/scenarios_hall.md and .json; exit status 1 if a bar is
-missed. `all` runs every scenario that has a bar.
+`python -m benchmarks.scenarios` runs every row with 5 seeds and writes results/scenarios.md and .json; names pick rows
+and write nothing. Each seed has its own world, beacons and orientation. Exit status 1 if a bar is missed.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import multiprocessing
 import os
-import platform
-import subprocess
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, field
-from datetime import UTC, datetime
-from importlib.metadata import version
-from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
+from benchmarks.sharpness import STRAY_M
+from benchmarks.suite import ROWS, STRAY, Row
+from benchmarks.tables import cell, line, plain, provenance, write
 from uwbslam_jax.__main__ import prepare
 
-RESULTS = Path(__file__).parent / "results"
-
-
-class Bar(NamedTuple):
-    """What every seed has to stay below: robot and beacons [m], heading [deg]."""
-
-    robot_rmse_m: float
-    beacon_mean_m: float
-    heading_deg_median: float
-
-
-BARS = {"hall": Bar(0.020, 0.020, 0.20)}
-"""Scenario -> bar. A scenario without one is measured all the same."""
+Seed = dict[str, Any]
+"""One seed's figures: those of `trials.measure`, `seed`, `load`, `checks` (name -> figure) and `failed` (in words)."""
 
 _COLUMNS = {
     "robot_rmse_m": ("robot RMS [m]", 4),
     "beacon_mean_m": ("beacons mean [m]", 4),
-    "beacon_max_m": ("beacons max [m]", 4),
     "heading_deg_median": ("heading median [deg]", 3),
     "decided_s": ("decided at [s]", 1),
+    "sharpness": ("map sharpness", 3),
     "real_time_factor": ("real-time factor", 1),
+}
+_MORE = {
+    "robot_max_m": ("robot max [m]", 3),
+    "beacon_max_m": ("beacons max [m]", 3),
+    "own_sharpness": ("map sharpness, own fit", 3),
+    "stray": ("stray cells", 3),
+    "pose_nees_ratio": ("pose NEES / dof", 2),
+    "beacon_nees_ratio": ("beacon NEES / dof", 2),
     "load": ("machine load", 1),
 }
+_HIGHER_IS_BETTER = {"sharpness", "own_sharpness", "real_time_factor"}
 
 
-@dataclass(frozen=True)
-class Row:
-    """One seed's figures; NaN where there is nothing to compare, decided_s where the frame never was decided.
-
-    load is the machine's (1 min average) when the seed was done: above 1 and other work has slowed the run down.
-    """
-
-    seed: int
-    robot_rmse_m: float
-    beacon_mean_m: float
-    beacon_max_m: float
-    heading_deg_median: float
-    decided_s: float
-    real_time_factor: float
-    load: float
-    beacons_missing: list[int] = field(default_factory=list)
-
-    def passes(self, bar: Bar) -> bool:
-        """Whether every figure stays below its bar and no beacon is missing; NaN never does."""
-        return not self.beacons_missing and all(getattr(self, key) < limit for key, limit in bar._asdict().items())
-
-
-def measure(name: str, seed: int, duration: float | None) -> Row:
-    """Simulates one seed, runs it and compares."""
+def judge(name: str, seed: int, duration: float | None) -> Seed:
+    """Simulates one seed, runs it and judges it."""
     # here, not above: a worker process sets up JAX on its own
-    from uwbslam_jax.metrics import evaluate
-    from uwbslam_jax.run import run_messages
-    from uwbslam_jax.settings_file import from_dict
-    from uwbslam_jax.simulate import scenario, settings_overrides, simulate
+    from benchmarks.trials import measure
+    from uwbslam_jax.simulate import scenario
 
     made = scenario(name, seed, duration)
-    result, truth = run_messages(list(simulate(made)), from_dict(settings_overrides(made)))
-    assert truth is not None
-    beacons = {beacon.id: beacon.position for beacon in result.beacons}
-    figures = evaluate(result.stamps, result.poses, beacons, truth)
-    keys = ("robot_rmse_m", "beacon_mean_m", "beacon_max_m", "heading_deg_median", "beacons_missing")
-    decided = result.summary["decided_at"]
-    return Row(
-        seed,
-        **{key: figures[key] for key in keys},
-        decided_s=math.nan if decided is None else decided,
-        real_time_factor=result.summary["real_time_factor"],
-        load=os.getloadavg()[0],
-    )
+    outcome = measure(made)
+    found = {check.name: check.measure(outcome.trial, made) for check in ROWS[name].checks}
+    failed = ROWS[name].shortfalls(outcome.figures, found)
+    # above a load of 1 other work has slowed the run down
+    return {"seed": seed, **outcome.figures, "load": os.getloadavg()[0], "checks": found, "failed": failed}
 
 
-def run_seeds(name: str, seeds: int, workers: int, duration: float | None) -> Iterator[Row]:
-    """The rows in order of their seeds, each as soon as it is there."""
+def run_seeds(name: str, seeds: int, workers: int, duration: float | None) -> Iterator[Seed]:
+    """The seeds in order, each as soon as it is there."""
     if workers <= 1:
-        yield from (measure(name, seed, duration) for seed in range(seeds))
+        yield from (judge(name, seed, duration) for seed in range(seeds))
         return
     context = multiprocessing.get_context("spawn")  # a forked JAX hangs
     with ProcessPoolExecutor(workers, mp_context=context) as pool:
-        yield from pool.map(measure, [name] * seeds, range(seeds), [duration] * seeds)
+        yield from pool.map(judge, [name] * seeds, range(seeds), [duration] * seeds)
 
 
-def provenance(workers: int) -> dict[str, str]:
-    """What the figures depend on besides the seeds."""
-    packages = ("jax", "jaxlib", "optimistix", "lineax", "numpy")
-    return {
-        "commit": _commit(),
-        "date": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
-        "CPU": f"{_cpu()}, {os.cpu_count()} cores, {workers} at once",
-        "Python": platform.python_version(),
-        **{name: version(name) for name in packages},
-        "dtype": "float32",
-    }
+def worst_and_median(seeds: list[Seed], key: str) -> tuple[float, float]:
+    """Of one figure; one that is missing is worse than any."""
+    sign = -1.0 if key in _HIGHER_IS_BETTER else 1.0
+    values = sorted(math.inf if math.isnan(seed[key]) else sign * seed[key] for seed in seeds)
+    middle = 0.5 * (values[(len(values) - 1) // 2] + values[len(values) // 2])
+    return sign * values[-1], sign * middle
 
 
-def _commit() -> str:
-    def git(*words: str) -> str:
-        folder = Path(__file__).parent
-        done = subprocess.run(["git", *words], cwd=folder, capture_output=True, text=True, check=False)
-        return done.stdout.strip()
-
-    # the tables that this writes do not count as a change
-    changed = git("status", "--porcelain", "--untracked-files=no", "--", "..", ":!results")
-    return (git("rev-parse", "--short", "HEAD") or "unknown") + (" with changes" if changed else "")
-
-
-def _cpu() -> str:
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text(encoding="utf-8").splitlines() if info.exists() else []
-    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
-
-
-def table(name: str, rows: list[Row], facts: dict[str, str]) -> str:
-    """The figures of one scenario in Markdown."""
-    bar = BARS.get(name)
-    head = ["seed", *(label for label, _ in _COLUMNS.values()), *(["bar"] if bar else [])]
-    lines = [f"# Scenario `{name}`, seeds 0 to {len(rows) - 1}", ""]
+def summary_table(rows: dict[str, list[Seed]], facts: dict[str, str]) -> str:
+    """The table of all scenarios in Markdown: worst and median of the seeds, bar and verdict."""
+    count = max(len(seeds) for seeds in rows.values())
+    lines = [f"# Scenarios in simulation, {count} seeds each, default settings", ""]
     lines += [", ".join(f"{key} {value}" for key, value in facts.items()) + ".", ""]
-    if bar:
-        limits = f"robot RMS {bar[0]:g} m, beacons mean {bar[1]:g} m, heading median {bar[2]:g} deg"
-        lines += [f"Bar for every seed: {limits}, every beacon placed.", ""]
-    lines += [line(head), line(["---:"] * len(head))]
-    for row in rows:
-        verdict = [("pass" if row.passes(bar) else "FAIL")] if bar else []
-        lines.append(line([str(row.seed), *_cells([row]), *verdict]))
-    passed = [f"{sum(row.passes(bar) for row in rows)} of {len(rows)}"] if bar else []
-    lines.append(line(["median", *_cells(rows), *passed]))
-    lines.append(line(["worst", *_cells(rows, worst=True), *([""] if bar else [])]))
-    missing = [f"seed {row.seed}: {', '.join(map(str, row.beacons_missing))}" for row in rows if row.beacons_missing]
-    return "\n".join([*lines, *(["", f"Beacons not placed: {'; '.join(missing)}."] if missing else [])]) + "\n"
-
-
-def line(cells: list[str]) -> str:
-    """One row of a Markdown table."""
-    return f"| {' | '.join(cells)} |"
-
-
-def _cells(rows: list[Row], worst: bool = False) -> list[str]:
-    """The median of each column, or its worst; a figure that is missing is worse than any."""
-    cells = []
-    for key, (_, digits) in _COLUMNS.items():
-        low_is_worse = key == "real_time_factor"
-        bad = -math.inf if low_is_worse else math.inf
-        values = sorted(
-            (bad if math.isnan(v) else v for v in (getattr(row, key) for row in rows)), reverse=low_is_worse
+    lines += [
+        "Figures are worst / median of the seeds, after one rigid motion over robot and beacons. "
+        "Every seed has its own world. "
+        "Bar: robot RMS [m] / beacons mean [m] / heading median [deg] where asked, then the row's own checks. "
+        "A row passes when every seed holds its bar, places every beacon and covers the whole time, and when at most "
+        f"{100 * STRAY:g} % of the map's occupied cells lie over {STRAY_M:g} m apart from every wall once the map "
+        "itself is laid over the walls. "
+        "Map sharpness: share of the occupied cells within one cell of a true wall where the fit of robot and beacons "
+        "puts the map; by the map's own fit it is in the table of the seeds.",
+        "",
+        line(["scenario", *(label for label, _ in _COLUMNS.values()), "bar", "checks, worst", "verdict"]),
+        line(["---", *["---:"] * len(_COLUMNS), "---", "---", "---"]),
+    ]
+    for name, seeds in rows.items():
+        figures = [
+            " / ".join(cell(v, digits) for v in worst_and_median(seeds, key)) for key, (_, digits) in _COLUMNS.items()
+        ]
+        lines.append(
+            line([f"`{name}`: {ROWS[name].title}", *figures, _bar(ROWS[name]), _checks(name, seeds), verdict(seeds)])
         )
-        middle = (values[(len(values) - 1) // 2] + values[len(values) // 2]) / 2
-        value = values[-1] if worst else middle
-        cells.append(f"{value:.{digits}f}" if math.isfinite(value) else "-")
-    return cells
+    return "\n".join(lines) + "\n"
 
 
-def run_scenario(name: str, seeds: int, workers: int, duration: float | None) -> bool:
-    """Measures one scenario, prints and writes its table; whether its bar is held."""
-    facts = provenance(workers)
-    rows = []
-    for row in run_seeds(name, seeds, workers, duration):
-        rows.append(row)
-        print(f"{name}: {line([str(row.seed), *_cells([row])])}", file=sys.stderr, flush=True)
-    text = table(name, rows, facts)
-    print(text)
-    if duration is None:  # shorter ones are for trying out
-        RESULTS.mkdir(exist_ok=True)
-        (RESULTS / f"scenarios_{name}.md").write_text(text, encoding="utf-8")
-        whole = {"scenario": name, "provenance": facts, "bar": BARS[name]._asdict() if name in BARS else None}
-        plain = [{k: None if v != v else v for k, v in asdict(row).items()} for row in rows]
-        path = RESULTS / f"scenarios_{name}.json"
-        path.write_text(json.dumps({**whole, "rows": plain}, indent=1) + "\n", encoding="utf-8")
-    return name not in BARS or all(row.passes(BARS[name]) for row in rows)
+def _bar(row: Row) -> str:
+    """The averages that are asked."""
+    return " / ".join("-" if math.isinf(limit) else f"{limit:g}" for limit in (row.robot, row.beacons, row.heading))
+
+
+def _checks(name: str, seeds: list[Seed]) -> str:
+    """The worst figure of each of a row's own checks, with its limit."""
+    told = []
+    for check in ROWS[name].checks:
+        values = [seed["checks"][check.name] for seed in seeds]
+        worst = math.nan if any(map(math.isnan, values)) else max(values)
+        told.append(f"{check.name} {cell(worst, 2)} (at most {check.limit:g})")
+    return "; ".join(told) or "-"
+
+
+def verdict(seeds: list[Seed]) -> str:
+    """Whether every seed holds, and how many do where not all do."""
+    held = sum(not seed["failed"] for seed in seeds)
+    return "pass" if held == len(seeds) else f"FAIL, {held} of {len(seeds)} hold"
+
+
+def seed_table(rows: dict[str, list[Seed]]) -> str:
+    """Every seed's figures in Markdown."""
+    columns = {**_COLUMNS, **_MORE}
+    lines = ["", "<details><summary>Every seed</summary>", ""]
+    lines += [line(["scenario", "seed", *(label for label, _ in columns.values()), "fails at"])]
+    lines += [line(["---", "---:", *["---:"] * len(columns), "---"])]
+    for name, seeds in rows.items():
+        for seed in seeds:
+            figures = [cell(seed[key], digits) for key, (_, digits) in columns.items()]
+            lines.append(line([f"`{name}`", str(seed["seed"]), *figures, "; ".join(seed["failed"])]))
+    return "\n".join([*lines, "", "</details>"]) + "\n"
 
 
 def main() -> int:
     """Returns 0, or 1 where a bar is missed."""
     prepare()  # before JAX is imported, which reads it once
-    from uwbslam_jax.simulate import SCENARIOS
-
     parser = argparse.ArgumentParser(prog="python -m benchmarks.scenarios", description=__doc__)
-    parser.add_argument("name", choices=[*SCENARIOS, "all"])
-    parser.add_argument("--seeds", type=int, default=10, help="run seeds 0 to this less one")
+    parser.add_argument("names", nargs="*", choices=[*ROWS, []], metavar="NAME", help=f"of {', '.join(ROWS)}")
+    parser.add_argument("--seeds", type=int, default=5, help="run seeds 0 to this less one")
     parser.add_argument("--workers", type=int, default=1, help="processes; step times are honest with one only")
     parser.add_argument("--duration", type=float, help="shorter recordings [s], for trying out: nothing is written")
     options = parser.parse_args()
-    names = list(BARS) if options.name == "all" else [options.name]
-    held = [run_scenario(name, options.seeds, options.workers, options.duration) for name in names]
-    return 0 if all(held) else 1
+    facts = provenance(options.workers)
+    rows: dict[str, list[Seed]] = {}
+    for name in options.names or ROWS:
+        for seed in run_seeds(name, options.seeds, options.workers, options.duration):
+            rows.setdefault(name, []).append(seed)
+            figures = ", ".join(f"{label} {cell(seed[key], digits)}" for key, (label, digits) in _COLUMNS.items())
+            checked = "".join(f", {check} {cell(value, 3)}" for check, value in seed["checks"].items())
+            told = "; ".join(seed["failed"]) or "pass"
+            print(f"{name} {seed['seed']}: {figures}{checked}: {told}", file=sys.stderr, flush=True)
+    text = summary_table(rows, facts)
+    print(text)
+    if not options.names and options.duration is None:
+        bars = {name: _limits(ROWS[name]) for name in rows}
+        write("scenarios", text + seed_table(rows), {"provenance": facts, "bars": bars, "rows": plain(rows)})
+    return 0 if all(verdict(seeds) == "pass" for seeds in rows.values()) else 1
+
+
+def _limits(row: Row) -> dict[str, float]:
+    """A row's bar and checks for JSON."""
+    asked = {"robot_rmse_m": row.robot, "beacon_mean_m": row.beacons, "heading_deg_median": row.heading}
+    return {key: value for key, value in asked.items() if math.isfinite(value)} | {c.name: c.limit for c in row.checks}
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import importlib.util
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from scipy.optimize import minimize
 from uwbslam_jax import metrics
 from uwbslam_jax.measurements import TruthMessage
 from uwbslam_jax.metrics import Truth
-from uwbslam_jax.result import BeaconEstimate
+from uwbslam_jax.result import BeaconEstimate, MapImage, Result
 
 EXACT = 1e-9  # rounding of a few float64 operations on numbers below 100
 SECOND = 1_000_000_000
@@ -241,22 +242,54 @@ def test_nees_of_honest_and_of_overconfident_covariances() -> None:
     assert np.isnan(metrics.nees(errors[:0], covs[:0]).mean)
 
 
-def test_consistency_of_a_run_in_a_turned_frame() -> None:
-    """Errors large along the robot's own x axis only: the covariance has to be turned with the frame."""
-    rng = np.random.default_rng(9)
-    count = 4000
+def consistent_run(seed: int, *, frame_error: float = 0.0) -> tuple[Result, Truth]:
+    """A run whose errors are what its covariances say, in the frame of beacons 3 and 8: 3 at the origin, 8 on +x.
+
+    frame_error: angle by which the beacon on +x, and with it the frame, is wrong [rad].
+    """
+    rng = np.random.default_rng(seed)
+    count, std = 4000, np.array([0.5, 0.05, 0.02])
+    spots = {node: rng.uniform(-10, 10, 2) for node in (3, 8, *range(10, 60))}
     robot = drive(rng, count)
-    spots = rng.uniform(-10, 10, (60, 2))
-    truth = Truth(np.arange(count) * SECOND, robot, {k: np.array([[0.0, *spot]]) for k, spot in enumerate(spots)})
-    std = np.array([0.5, 0.05, 0.02])
-    angle, shift = 0.7, np.array([3.0, 4.0])
-    turn = np.eye(3)
-    turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-    cov = turn @ np.diag(std**2) @ turn.T
-    poses = moved(robot + rng.normal(0, std, (count, 3)), angle, shift)
-    positions = moved(spots + rng.normal(0, std[:2], spots.shape), angle, shift)
-    beacons = [BeaconEstimate(k, xy, cov[:2, :2], "static") for k, xy in enumerate(positions)]
-    figures = metrics.consistency(truth.stamps, poses, np.broadcast_to(cov, (count, 3, 3)), beacons, truth)
-    assert figures["pose_nees_ratio"] == pytest.approx(1, abs=0.15)
-    assert figures["beacon_nees_ratio"] == pytest.approx(1, abs=0.5)  # 60 beacons: three sigma of the mean
-    assert figures["pose_nees"] == pytest.approx(3 * figures["pose_nees_ratio"])
+    truth = Truth(np.arange(count) * SECOND, robot, {n: np.array([[0.0, *xy]]) for n, xy in spots.items()})
+    to = spots[8] - spots[3]
+    angle = -np.arctan2(to[1], to[0]) - frame_error
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    shift = -turn @ spots[3]
+    poses = moved(robot, angle, shift) + rng.normal(0, std, (count, 3))
+    beacons = []
+    for node, xy in spots.items():
+        error = rng.normal(0, std[:2]) * {3: (0, 0), 8: (1, 0)}.get(node, (1, 1))
+        beacons.append(BeaconEstimate(node, turn @ xy + shift + error, np.diag(std[:2] ** 2), "static"))
+    empty = MapImage(np.zeros((1, 1), np.float32), 0.05, np.zeros(2))
+    covs = np.broadcast_to(np.diag(std**2), (count, 3, 3)).copy()
+    summary = {"frame_beacons": [3, 8], "decided_at": 2000.0}
+    poses[:2000, :2] += 3.0  # before the frame was decided nothing is judged
+    nothing = np.zeros((0, 4))
+    return Result(truth.stamps, poses, covs, beacons, {}, empty, nothing, nothing[:, :2], summary=summary), truth
+
+
+def test_consistency_is_judged_in_the_frame_of_the_true_beacons() -> None:
+    figures = metrics.consistency(*consistent_run(9))
+    assert figures["pose_nees_ratio"] == pytest.approx(1, abs=0.08)  # 2000 poses: four sigma of the mean
+    assert figures["beacon_nees_ratio"] == pytest.approx(1, abs=0.6)  # 101 numbers: four sigma
+    wrong = metrics.consistency(*consistent_run(9, frame_error=0.2))
+    assert wrong["pose_nees_ratio"] > 10  # a fit over robot and beacons would have turned this away
+    assert wrong["beacon_nees_ratio"] > 10
+
+
+def test_consistency_of_a_run_without_its_frame_in_the_truth_is_nan() -> None:
+    result, truth = consistent_run(10)
+    for frame in (None, [3, 99], [3, 3]):
+        told = dataclasses.replace(result, summary={**result.summary, "frame_beacons": frame})
+        assert all(np.isnan(v) for v in metrics.consistency(told, truth).values())
+
+
+def test_a_frame_whose_beacons_move_stays_where_it_was_decided() -> None:
+    history = {
+        1: np.array([[0.0, 1.0, 2.0], [10.0 * SECOND, 9.0, 9.0]]),
+        2: np.array([[0.0, 1.0, 5.0], [1.0 * SECOND, 1.0, 6.0]]),
+    }
+    truth = Truth(np.array([0]), np.zeros((1, 3)), history)
+    frame = metrics.published_frame(truth, 1, 2, 5 * SECOND)
+    np.testing.assert_allclose(frame.points(np.array([[0.0, 0.0], [4.0, 0.0]])), [[1, 2], [1, 6]], atol=EXACT)

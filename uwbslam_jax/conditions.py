@@ -63,7 +63,7 @@ class Beacon:
 
 @dataclass(frozen=True)
 class Lidar:
-    """A scanner; the defaults are a Hokuyo UTM-30LX-EW.
+    """A scanner; the defaults are a Hokuyo UTM-30LX-EW, whose mirror turns 40 times a second.
 
     Attributes:
       rate: scans a second [Hz].
@@ -71,7 +71,11 @@ class Lidar:
       range_min, range_max: limits of the sensor [m].
       reach: walls farther than this do not return [m].
       sigma: standard deviation of a range [m].
+      quantum: ranges are whole multiples of it [m]; 0 for none.
+      dropout: share of the beams that do not come back, whatever they meet.
+      grazing: walls seen flatter than this return the less the flatter [rad].
       time_increment: time from beam to beam [s]; 0 takes the whole sweep at once.
+      jitter: a sweep begins up to this much late [s]; its stamp says so.
       pose: x, y [m], yaw [rad] on the robot.
       blind: intervals without any return.
     """
@@ -83,7 +87,11 @@ class Lidar:
     range_max: float = 30.0
     reach: float = INF
     sigma: float = 0.01
-    time_increment: float = 0.0
+    quantum: float = 0.001
+    dropout: float = 0.01
+    grazing: float = 0.08
+    time_increment: float = 1.0 / 40.0 / 1440.0
+    jitter: float = 0.002
     pose: tuple[float, float, float] = (0.0, 0.0, 0.0)
     blind: tuple[Interval, ...] = ()
 
@@ -97,7 +105,10 @@ class Uwb:
       antenna: x, y, z on the robot [m].
       rate: rounds a second [Hz]; less where a round's exchanges take longer.
       exchange: time that one pair takes [s].
+      jitter: an exchange takes place up to this much late [s]; its stamp says so.
+      loss: share of the exchanges that fail.
       sigma: standard deviation of a range [m].
+      quantum: ranges are whole multiples of it [m]; 0 for none.
       beacon_pairs: whether beacons range to each other.
       reach: pairs farther apart do not hear each other [m].
       bias: range bias of a node by id [m]; a pair's is the sum of both.
@@ -114,7 +125,10 @@ class Uwb:
     antenna: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rate: float = 10.0
     exchange: float = 0.003
+    jitter: float = 0.0005
+    loss: float = 0.02
     sigma: float = 0.1
+    quantum: float = 0.01
     beacon_pairs: bool = True
     reach: float = INF
     bias: dict[int, float] = field(default_factory=dict)

@@ -12,6 +12,12 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 
+def smooth(u: np.ndarray) -> np.ndarray:
+    """From 0 at 0 to 1 at 1 with no slope at either end, constant beyond."""
+    u = np.clip(u, 0.0, 1.0)
+    return u**2 * (3.0 - 2.0 * u)
+
+
 class Track:
     """A line through waypoints with rounded corners, by arc length.
 
@@ -50,9 +56,36 @@ class Track:
             pose.append(np.column_stack([xy, heading[k] + shape[:, 2]]))
         s.append(s[-1][-1:] + edges[-1] - cut[-2])
         pose.append(np.array([[*points[-1], heading[-1]]]))
-        self._s, self._pose, self._closed = np.concatenate(s), np.concatenate(pose), closed
-        self.length = float(self._s[-1])
+        self._set(np.concatenate(s), np.concatenate(pose), closed)
         self.first_turn = float(s[1][0])
+
+    def _set(self, s: np.ndarray, pose: np.ndarray, closed: bool) -> None:
+        self._s, self._pose, self._closed = s, pose, closed
+        self.length = float(s[-1])
+
+    def swayed(self, amplitude: float, rng: np.random.Generator) -> Track:
+        """The track of a driver who wanders up to `amplitude` [m] to either side, in waves of 6 m and longer.
+
+        The same on each round of a closed track; an open one begins and ends as before.
+        """
+        s = np.linspace(0.0, self.length, int(self.length / 0.02) + 2)
+        cycles = rng.integers(1, max(int(self.length / 6.0), 1) + 1, 3)
+        aside = np.sum(np.sin(2.0 * np.pi * (np.outer(s / self.length, cycles) + rng.uniform(size=3))), axis=1)
+        if not self._closed:
+            aside *= smooth(s / 2.0) * smooth((self.length - s) / 2.0)
+        aside *= amplitude / np.max(np.abs(aside))
+        pose = np.stack([np.interp(s, self._s, column) for column in self._pose.T], -1)
+        pose[:, :2] += aside[:, None] * np.stack([-np.sin(pose[:, 2]), np.cos(pose[:, 2])], -1)
+        pose[:, 2] += np.arctan2(np.gradient(aside, s), 1.0 - aside * np.gradient(pose[:, 2], s))
+        # differences are one-sided at the ends, where both rounds of a closed track have to meet
+        pose[0, 2] = 0.5 * (pose[1, 2] + pose[-2, 2] - self._pose[-1, 2] + self._pose[0, 2])
+        pose[-1, 2] = pose[0, 2] + self._pose[-1, 2] - self._pose[0, 2]
+        if not self._closed:
+            pose[[0, -1], 2] = self._pose[[0, -1], 2]
+        track = Track.__new__(Track)
+        track._set(np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(pose[:, :2], axis=0).T))]), pose, self._closed)
+        track.first_turn = 0.0
+        return track
 
     def pose(self, s: np.ndarray) -> np.ndarray:
         """Pose (n, 3) [m, m, rad] at arc length s (n,) [m]; yaw does not wrap. A closed track goes on round."""
@@ -158,8 +191,7 @@ class Carried:
     duration: float = 1.0
 
     def pose(self, time: np.ndarray, start: np.ndarray) -> np.ndarray:
-        u = np.clip(time / self.duration, 0.0, 1.0)[:, None]
-        return start + (np.asarray(self.to) - start) * u**2 * (3.0 - 2.0 * u)
+        return start + (np.asarray(self.to) - start) * smooth(time / self.duration)[:, None]
 
 
 class Path:
@@ -205,6 +237,11 @@ class Path:
         c, s = np.cos(self._origin[2]), np.sin(self._origin[2])
         xy = local[:, :2] @ np.array([[c, s], [-s, c]]) + self._origin[:2]
         return np.column_stack([xy, local[:, 2] + self._origin[2]])
+
+    def spans(self, kind: type) -> list[tuple[float, float]]:
+        """From, to [s] of each piece of a kind."""
+        times = self._times.tolist()
+        return [(times[k], times[k + 1]) for k, piece in enumerate(self.pieces) if isinstance(piece, kind)]
 
     @property
     def speed(self) -> float:

@@ -11,14 +11,17 @@ from typing import Any
 
 import numpy as np
 
-from uwbslam_jax import worlds
+from uwbslam_jax import rays, worlds
 from uwbslam_jax.conditions import INF, Beacon, Follow, Lidar, Scenario, Uwb, Walk, Wheels, stream
 from uwbslam_jax.paths import Along, Carried, Path, Piece, Rest, Track, Turn
 from uwbslam_jax.worlds import World
 
 
 def scenario(name: str, seed: int = 0, duration_s: float | None = None) -> Scenario:
-    """A ready-made scenario; each seed has its own world, beacons and orientation. `SCENARIOS` lists the names."""
+    """A ready-made scenario; each seed has its own world, beacons and orientation. `SCENARIOS` lists the names.
+
+    duration_s: instead of the scenario's own; what happens once (but for the paper's schedule) happens sooner then.
+    """
     if name not in _MAKERS:
         raise ValueError(f"no scenario is called {name!r}; there are {', '.join(SCENARIOS)}")
     made = _MAKERS[name](seed, duration_s)
@@ -44,7 +47,7 @@ def spread(world: World, route: np.ndarray, count: int, rng: np.random.Generator
     while True:
         spots = rng.uniform(low, high, (800, 2))
         spots = spots[worlds.free(world, spots)]
-        spots = spots[worlds.point_segment_distance(spots, world.segments).min(1) > 0.3]
+        spots = spots[rays.point_segment_distance(spots, world.segments).min(1) > 0.3]
         to_route = np.min(np.hypot(*np.moveaxis(spots[:, None] - route[None, :, :2], -1, 0)), axis=1)
         chosen: list[np.ndarray] = []
         for spot in spots[to_route > 0.5]:
@@ -69,10 +72,9 @@ def _beacons(world: World, track: Track, seed: int, ids: Sequence[int], height: 
 
 
 def _directed(world: World, seed: int) -> World:
-    """The world with its lap driven clockwise or counter-clockwise and begun at a corner of the seed's choice."""
-    rng = stream(seed, "direction")
-    lap = world.lap[::-1] if rng.uniform() < 0.5 else world.lap
-    return replace(world, lap=np.roll(lap, rng.integers(len(lap)), axis=0))
+    """The world with its lap begun at a corner of the seed's choice, clockwise where the seed is odd."""
+    lap = world.lap[::-1] if seed % 2 else world.lap
+    return replace(world, lap=np.roll(lap, stream(seed, "direction").integers(len(lap)), axis=0))
 
 
 def _laps(
@@ -83,10 +85,14 @@ def _laps(
     speed: float = 0.8,
     radius: float = 1.2,
     height: float = 0.0,
+    sway: float = 0.0,
+    rest: float = 4.0,
 ) -> Scenario:
-    """Rest for 4 s, then laps to the end."""
+    """Rest for a while [s], then laps to the end; sway: the driver wanders this far to either side [m]."""
     track = Track(world.lap, radius, closed=True)
-    path = Path([Rest(4.0), Along(track, 0.0, speed * max(duration - 4.0, 1.0), speed)])
+    if sway > 0.0:
+        track = track.swayed(sway, stream(seed, "sway"))
+    path = Path([Rest(rest), Along(track, 0.0, speed * max(duration - rest, 1.0), speed)])
     return Scenario("laps", seed, duration, world, path, _beacons(world, track, seed, ids, height))
 
 
@@ -102,6 +108,8 @@ def _workshop(seed: int, duration: float | None) -> Scenario:
 def _hall(seed: int, duration: float | None, ids: Sequence[int] = (7, 3, 12, 5, 9), **options: Any) -> Scenario:
     world = _directed(worlds.hall(seed), seed)
     ids = [int(i) for i in stream(seed, "ids").permutation(ids)]
+    driver = stream(seed, "driver")
+    options = {"speed": driver.uniform(0.6, 1.0), "rest": driver.uniform(0.5, 6.0), "sway": 0.15, **options}
     return _laps(world, seed, duration or 150.0, ids, **options)
 
 
@@ -111,7 +119,7 @@ def _hall40(seed: int, duration: float | None) -> Scenario:
 
 
 def _fast(seed: int, duration: float | None) -> Scenario:
-    return replace(_hall(seed, duration, speed=1.6, radius=0.9), lidar=Lidar(time_increment=1.0 / 40.0 / 1440.0))
+    return _hall(seed, duration, speed=1.6, radius=0.9, sway=0.05)
 
 
 def _spot_turns(seed: int, duration: float | None) -> Scenario:
@@ -140,13 +148,17 @@ def _spot_turns(seed: int, duration: float | None) -> Scenario:
 
 
 def _nlos(seed: int, duration: float | None) -> Scenario:
-    return replace(_hall(seed, duration), uwb=Uwb(nlos=True))
+    """The powers tell half to all of the blocked exchanges: that is a matter of the walls."""
+    return replace(_hall(seed, duration), uwb=Uwb(nlos=True, nlos_detectable=stream(seed, "walls").uniform(0.5, 1.0)))
 
 
 def _early(seed: int, duration: float | None) -> Scenario:
+    """Two radios that lock early in stretches of 30 s: 40 % of the ranges every minute, or all of them 40 % of the
+    time where the seed is odd."""
     made = _hall(seed, duration)
-    stretches = tuple((t, t + 30.0) for t in np.arange(20.0, made.duration, 60.0))
-    return replace(made, uwb=Uwb(early_node=made.beacons[1].id, early=stretches))
+    share, period = (1.0, 75.0) if seed % 2 else (0.4, 60.0)
+    stretches = tuple((t, t + 30.0) for t in np.arange(20.0, made.duration, period))
+    return replace(made, uwb=Uwb(early_node=made.beacons[1].id, early=stretches, early_share=share))
 
 
 def _schedule(seed: int, duration: float | None) -> Scenario:
@@ -159,25 +171,32 @@ def _schedule(seed: int, duration: float | None) -> Scenario:
 
 
 def _frame_moved(seed: int, duration: float | None) -> Scenario:
-    """The two beacons of the lowest ids, which fix the frame, are carried elsewhere and then switched off."""
+    """The two beacons that fix the frame, the lowest id and the one farthest from it, are carried and switched off."""
     made = _hall(seed, duration)
     track = Track(made.world.lap, 1.2, closed=True)
     goals = spread(made.world, track.sample(0.25), 2, stream(seed, "moved"), apart=4.0)
     beacons = {b.id: b for b in made.beacons}
-    for k, number in enumerate(sorted(beacons)[:2]):
+    first = beacons[min(beacons)]
+    farthest = max(made.beacons, key=lambda b: np.hypot(*np.subtract(b.position, first.position)))
+    for k, number in enumerate((first.id, farthest.id)):
         goal = (float(goals[k][0]), float(goals[k][1]))
-        walk = Walk(60.0 + 8.0 * k, 72.0 + 8.0 * k, goal)
-        beacons[number] = replace(beacons[number], moves=(walk,), alive=((0.0, 105.0 + 8.0 * k),))
+        begin = 0.4 * made.duration + 8.0 * k
+        walk = Walk(begin, begin + 12.0, goal)
+        beacons[number] = replace(beacons[number], moves=(walk,), alive=((0.0, begin + 45.0),))
     return replace(made, beacons=tuple(beacons.values()))
 
 
 def _corridor(seed: int, duration: float | None, recesses: bool = False) -> Scenario:
-    """Two laps to and fro with turns on the spot, walls seen 6 m far."""
+    """Two laps to and fro with turns on the spot, walls seen 6 m far; the driver sways by up to 0.3 m."""
     world = worlds.corridor(recesses=recesses, seed=seed)
-    out, back = Track(world.lap, 1.0), Track(world.lap[::-1], 1.0)
+    driver = stream(seed, "sway")
+    ends = world.lap + np.column_stack([np.zeros(2), driver.uniform(-0.1, 0.1, 2)])
     side = stream(seed, "direction").choice([-1.0, 1.0])
-    lap = [Along(out, 0.0, out.length), Turn(side * np.pi), Along(back, 0.0, back.length), Turn(side * np.pi)]
-    path = Path([Rest(4.0), *lap, *lap, Rest(2.0)])
+    pieces: list[Piece] = [Rest(4.0)]
+    for to in (ends, ends[::-1], ends, ends[::-1]):
+        track = Track(to, 1.0).swayed(0.2, driver)
+        pieces += [Along(track, 0.0, track.length), Turn(side * np.pi)]
+    path = Path([*pieces, Rest(2.0)])
     rng = stream(seed, "beacons")
     along = np.linspace(1.0, 21.7, 5) + rng.uniform(-0.6, 0.6, 5)
     across = np.where(np.arange(5) % 2 == 0, 0.3, 2.1) + rng.uniform(-0.1, 0.1, 5)
@@ -188,7 +207,7 @@ def _corridor(seed: int, duration: float | None, recesses: bool = False) -> Scen
 def _straight(seed: int, duration: float | None) -> Scenario:
     """12 m straight ahead before the first turn."""
     world = worlds.hall(seed, size=(12.5, 22.0))
-    lap = world.lap if stream(seed, "direction").uniform() < 0.5 else world.lap[[1, 0, 3, 2]]
+    lap = world.lap[[1, 0, 3, 2]] if seed % 2 else world.lap
     lap = np.roll(lap, 2, axis=0)  # the edge before the first waypoint is a long one
     track = Track(lap, 1.2, closed=True)
     track = Track(lap, 1.2, closed=True, lead=0.5 * float(np.hypot(*(lap[0] - lap[-1]))) - track.first_turn + 12.0)
@@ -197,21 +216,25 @@ def _straight(seed: int, duration: float | None) -> Scenario:
 
 
 def _blind(seed: int, duration: float | None) -> Scenario:
-    return replace(_hall(seed, duration), lidar=Lidar(blind=((70.0, 75.0),)))
+    made = _hall(seed, duration)
+    begin = made.duration * 7.0 / 15.0
+    return replace(made, lidar=Lidar(blind=((begin, begin + 5.0),)))
 
 
 def _uwb_silent(seed: int, duration: float | None) -> Scenario:
-    return replace(_hall(seed, duration), uwb=Uwb(silent=((60.0, 90.0),)))
+    made = _hall(seed, duration)
+    return replace(made, uwb=Uwb(silent=((0.4 * made.duration, 0.6 * made.duration),)))
 
 
 def _kidnapped(seed: int, duration: float | None) -> Scenario:
-    """After 70 s picked up and put down a good part of a lap farther, turned by 120 degrees, unseen by the LiDAR."""
+    """Half way picked up and put down a good part of a lap farther, turned by 120 degrees, unseen by the LiDAR."""
     made = _hall(seed, duration)
     track = Track(made.world.lap, 1.2, closed=True)
-    first: list[Piece] = [Rest(4.0), Along(track, 0.0, 0.8 * 64.0)]
+    driven = 0.8 * (made.duration * 7.0 / 15.0 - 6.0)
+    first: list[Piece] = [Rest(4.0), Along(track, 0.0, driven)]
     when = Path(first).duration
-    before = track.pose(np.array([0.8 * 64.0]))[0]
-    there = 0.8 * 64.0 + 0.35 * track.length
+    before = track.pose(np.array([driven]))[0]
+    there = driven + 0.35 * track.length
     x, y, tangent = track.pose(np.array([there]))[0]
     yaw = before[2] + 2.0 * np.pi / 3.0
     back = (tangent - yaw + np.pi) % (2.0 * np.pi) - np.pi
@@ -222,7 +245,7 @@ def _kidnapped(seed: int, duration: float | None) -> Scenario:
 
 def _slow_lidar(seed: int, duration: float | None) -> Scenario:
     made = _hall(seed, duration or 300.0, ids=(2, 4, 6), speed=0.35)
-    lidar = Lidar(rate=1.0, beams=361, field_of_view=np.pi)
+    lidar = Lidar(rate=1.0, beams=361, field_of_view=np.pi, time_increment=1.0 / 75.0 / 720.0)
     return replace(made, lidar=lidar, uwb=Uwb(beacon_pairs=False), wheels=Wheels())
 
 
@@ -235,14 +258,15 @@ def _biased(seed: int, duration: float | None) -> Scenario:
     """Each node's antenna delay is off by 0.15 m rms, and nobody has calibrated it."""
     made = _hall(seed, duration)
     ids = [0, *sorted(b.id for b in made.beacons)]
-    bias = stream(seed, "bias").normal(0.0, 0.15, len(ids))
+    bias = stream(seed, "bias").normal(size=len(ids))
+    bias *= 0.15 / np.sqrt(np.mean(bias**2))
     return replace(made, uwb=Uwb(bias={i: float(b) for i, b in zip(ids, bias, strict=True)}))
 
 
 def _office(seed: int, duration: float | None) -> Scenario:
     """Twice round the corridors, 300 m; beacons along the corridors' walls hear 25 m far."""
     world = _directed(worlds.office(seed), seed)
-    track = Track(world.lap, 0.9, closed=True)
+    track = Track(world.lap, 0.9, closed=True).swayed(0.15, stream(seed, "sway"))
     path = Path([Rest(4.0), Along(track, 0.0, 2.0 * track.length), Rest(2.0)])
     if duration is not None:
         path = Path([Rest(4.0), Along(track, 0.0, 0.8 * max(duration - 4.0, 1.0))])

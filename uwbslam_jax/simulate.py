@@ -16,9 +16,10 @@ from uwbslam_jax.conditions import Beacon, Follow, Interval, Lidar, Uwb, stream
 from uwbslam_jax.conditions import Scenario as Scenario
 from uwbslam_jax.conditions import settings_overrides as settings_overrides
 from uwbslam_jax.measurements import NAN, Message, OdometryMessage, RangeMessage, ScanMessage, TruthMessage
+from uwbslam_jax.paths import smooth
+from uwbslam_jax.rays import blocked, strike
 from uwbslam_jax.scenarios import SCENARIOS as SCENARIOS
 from uwbslam_jax.scenarios import scenario as scenario
-from uwbslam_jax.worlds import blocked, cast
 
 START_NS = 1_700_000_000_123_456_789
 """Stamp of a simulation's time 0 [ns]; float32 and even float64 seconds cannot hold it exactly, as in life."""
@@ -26,6 +27,8 @@ UWB_PHASE = 0.0137
 """The first round of ranges starts this late [s]: two devices never share a clock."""
 ROUNDS = 16
 """Rounds of ranges that are drawn at a time."""
+_RANDOM = ("noise", "nlos", "outlier", "early", "power", "gap", "loss", "jitter")
+"""Each fault of a range draws from a stream of its own."""
 TRUTH_PERIOD = 1.0
 """Time between two truths of a beacon at rest [s]; of one that is carried, a tenth of it."""
 
@@ -60,6 +63,11 @@ def _during(intervals: Sequence[Interval], t: np.ndarray) -> np.ndarray:
 
 def scan_ranges(scenario: Scenario, t: float) -> np.ndarray:
     """Exact distances (beams,) [m] of the sweep that begins at time t [s], without noise or limits; inf for none."""
+    return _sweep(scenario, t)[0]
+
+
+def _sweep(scenario: Scenario, t: float) -> tuple[np.ndarray, np.ndarray]:
+    """The same, and the angles between beams and walls (beams,) [rad]."""
     lidar = scenario.lidar
     beams = np.arange(lidar.beams)
     bearings = _angle_min(lidar) + beams * _angle_increment(lidar)
@@ -68,7 +76,7 @@ def scan_ranges(scenario: Scenario, t: float) -> np.ndarray:
     x, y, yaw = lidar.pose
     c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
     origins = pose[:, :2] + np.stack([c * x - s * y, s * x + c * y], -1)
-    return cast(scenario.world.segments, origins, pose[:, 2] + yaw + bearings)
+    return strike(scenario.world.segments, origins, pose[:, 2] + yaw + bearings)
 
 
 def _angle_min(lidar: Lidar) -> float:
@@ -82,13 +90,16 @@ def _angle_increment(lidar: Lidar) -> float:
 def _scans(scenario: Scenario) -> Iterator[Logged]:
     """Scans, each after the truth of the robot's pose at its stamp."""
     lidar = scenario.lidar
-    noise = stream(scenario.seed, "scan noise")
+    noise, lost, late = (stream(scenario.seed, f"scan {purpose}") for purpose in ("noise", "returns", "jitter"))
     sweep = round((lidar.beams - 1) * lidar.time_increment * 1e9)
     for k in range(int(scenario.duration * lidar.rate)):
-        t = k / lidar.rate
-        ranges = scan_ranges(scenario, t) + lidar.sigma * noise.normal(size=lidar.beams)
+        t = k / lidar.rate + lidar.jitter * late.uniform()
+        exact, glance = _sweep(scenario, t)
+        ranges = _rounded(exact + lidar.sigma * noise.normal(size=lidar.beams), lidar.quantum)
+        draw = lost.uniform(size=(2, lidar.beams))
+        returned = (draw[0] >= lidar.dropout) & (draw[1] * lidar.grazing <= glance)
         seen = (ranges >= lidar.range_min) & (ranges <= min(lidar.range_max, lidar.reach))
-        seen &= not _during(lidar.blind, np.array([t]))[0]
+        seen &= returned & ~_during(lidar.blind, np.array([t]))
         ranges = np.where(seen, ranges, np.inf).astype(np.float32)
         x, y, yaw = scenario.path.pose(np.array([t]))[0]
         at = stamp(t)
@@ -96,6 +107,11 @@ def _scans(scenario: Scenario) -> Iterator[Logged]:
         angles = (_angle_min(lidar), _angle_increment(lidar))
         limits = (lidar.range_min, lidar.range_max)
         yield at + sweep, ScanMessage(at, *angles, lidar.time_increment, *limits, ranges)
+
+
+def _rounded(values: np.ndarray, quantum: float) -> np.ndarray:
+    """Values (n,) as whole multiples of the quantum, unchanged where that is 0."""
+    return quantum * np.round(values / quantum) if quantum > 0.0 else values
 
 
 # UWB -----------------------------------------------------------------------------------------------------------------
@@ -112,22 +128,16 @@ def beacon_positions(scenario: Scenario, beacon: Beacon, t: np.ndarray) -> np.nd
             robot = scenario.path.pose(clipped - move.lag)
             left = np.stack([-np.sin(robot[:, 2]), np.cos(robot[:, 2])], -1)
             goal = robot[:, :2] + move.aside * left
-            blend = _smooth((clipped - move.start) / move.approach) if move.approach > 0.0 else np.ones(t.size)
+            blend = smooth((clipped - move.start) / move.approach) if move.approach > 0.0 else np.ones(t.size)
         else:
             goal = np.tile(np.asarray(move.to, float), (t.size, 1))
-            blend = _smooth((clipped - move.start) / (move.end - move.start))
+            blend = smooth((clipped - move.start) / (move.end - move.start))
         there = position + blend[:, None] * (goal - position)
         # Hands are still when the beacon is taken and put down.
-        still = _smooth(np.minimum(clipped - move.start, move.end - clipped))
+        still = smooth(np.minimum(clipped - move.start, move.end - clipped))
         there += still[:, None] * _jitter(scenario.seed, beacon.id, number, clipped)
         position = np.where((t >= move.start)[:, None], there, position)
     return position
-
-
-def _smooth(u: np.ndarray) -> np.ndarray:
-    """From 0 to 1 with no slope at either end."""
-    u = np.clip(u, 0.0, 1.0)
-    return u**2 * (3.0 - 2.0 * u)
 
 
 def _jitter(seed: int, node: int, number: int, t: np.ndarray) -> np.ndarray:
@@ -155,22 +165,24 @@ def _ranges(scenario: Scenario) -> Iterator[Logged]:
     used = (i == 0) | uwb.beacon_pairs
     period = max(1.0 / uwb.rate, uwb.exchange * np.count_nonzero(used))
     rounds = int((scenario.duration - UWB_PHASE) / period)
-    draws = {d: stream(scenario.seed, f"uwb {d}") for d in ("noise", "nlos", "outlier", "early", "power", "gap")}
+    draws = {d: stream(scenario.seed, f"uwb {d}") for d in _RANDOM}
     for first in range(0, rounds, ROUNDS):
         # All rounds of a block have the same pairs and each purpose its own numbers for every one of them, heard or
         # not: no knob moves another's numbers.
         count = min(ROUNDS, rounds - first)
         t = UWB_PHASE + period * (first + np.arange(count))[:, None] + uwb.exchange * np.arange(i.size)
-        t, left, right = t.ravel(), np.tile(i, count), np.tile(j, count)
+        t = t.ravel() + uwb.jitter * draws["jitter"].uniform(size=t.size)
+        left, right = np.tile(i, count), np.tile(j, count)
         nodes = _node_positions(scenario, t)
         a, b = nodes[left, np.arange(t.size)], nodes[right, np.arange(t.size)]
         distance = np.sqrt(np.sum((a - b) ** 2, -1))
         wall = blocked(scenario.world.segments, a[:, :2], b[:, :2]) if uwb.nlos else np.zeros(t.size, bool)
-        measured = distance + _range_errors(uwb, draws, ids[left], ids[right], t, wall)
+        measured = _rounded(distance + _range_errors(uwb, draws, ids[left], ids[right], t, wall), uwb.quantum)
         receive, first_path = _powers(uwb, draws, distance, wall)
         on = np.array([np.ones(t.size, bool), *(_during(b.alive, t) for b in scenario.beacons)])
         on = on[left, np.arange(t.size)] & on[right, np.arange(t.size)]
         heard = np.tile(used, count) & on & (distance <= uwb.reach) & ~_during(uwb.silent, t)
+        heard &= draws["loss"].uniform(size=t.size) >= uwb.loss
         for p in np.flatnonzero(heard & (t < scenario.duration)).tolist():
             at, pair = stamp(t[p]), (int(ids[left[p]]), int(ids[right[p]]))
             yield at, RangeMessage(at, *pair, max(float(measured[p]), 0.0), float(receive[p]), float(first_path[p]))

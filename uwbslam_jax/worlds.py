@@ -1,6 +1,6 @@
-"""Worlds of line segments to simulate in: a workshop, random halls, a corridor, an office; and exact ray casting.
+"""Worlds of line segments to simulate in: a workshop, random halls, a corridor, an office.
 
-A world is walls and furniture seen from above. Nothing here moves, measures or knows noise.
+A world is walls and furniture seen from above. Nothing here moves, measures or knows noise; rays are in `rays`.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from uwbslam_jax.paths import Track
+from uwbslam_jax.rays import point_segment_distance
 
 Point = Sequence[float] | np.ndarray
 """x, y [m]."""
@@ -49,76 +50,7 @@ def place(pose: Sequence[float], points: np.ndarray) -> np.ndarray:
     return points @ np.array([[c, s], [-s, c]]) + np.asarray(pose[:2])
 
 
-# Ray casting ---------------------------------------------------------------------------------------------------------
-
-
-def cast(segments: np.ndarray, origins: np.ndarray, angles: np.ndarray) -> np.ndarray:
-    """Distance along each ray to the first segment that it meets.
-
-    A segment is tried only against the rays whose bearing falls into the arc under which it is seen, so the cost is
-    that of the crossings and not rays times segments.
-
-    Args:
-      segments: (S, 4) [m].
-      origins: (2,) or (B, 2) start of each ray [m]; they may differ by what a robot drives during one sweep.
-      angles: (B,) bearing of each ray in the world [rad], increasing, of at most one turn in all.
-    Returns:
-      (B,) distance [m], inf where nothing is met.
-    """
-    origins = np.broadcast_to(np.asarray(origins, float), (angles.size, 2))
-    ray, wall = _candidates(segments, origins, angles)
-    start, along = segments[wall, :2], segments[wall, 2:] - segments[wall, :2]
-    direction = np.stack([np.cos(angles), np.sin(angles)], -1)[ray]
-    to_start = start - origins[ray]
-    det = _cross(direction, along)
-    with np.errstate(divide="ignore", invalid="ignore"):  # a ray parallel to a wall: 0/0 fails the test below
-        distance = _cross(to_start, along) / det
-        share = _cross(to_start, direction) / det
-    # A hair more than [0, 1], else rounding lets a ray slip through the corner that two walls share.
-    hit = (distance > 0.0) & (share >= -1e-12) & (share <= 1.0 + 1e-12)
-    result = np.full(angles.size, np.inf)
-    np.minimum.at(result, ray[hit], distance[hit])
-    return result
-
-
-def _candidates(segments: np.ndarray, origins: np.ndarray, angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Indices (ray, segment) of all pairs that may meet, both (n,)."""
-    centre = 0.5 * (origins.min(0) + origins.max(0))
-    spread = float(np.max(np.hypot(*(origins - centre).T)))
-    first, second = segments[:, :2] - centre, segments[:, 2:] - centre
-    bearing = np.arctan2(first[:, 1], first[:, 0])
-    arc = np.arctan2(_cross(first, second), np.sum(first * second, -1))  # signed, seen from the centre
-    near = point_segment_distance(np.zeros((1, 2)), np.hstack([first, second]))[0]
-    # Seen from an origin `spread` beside the centre the arc widens by at most asin(spread / distance).
-    pad = np.where(near > 2.0 * spread + 1e-6, np.arcsin(np.clip(spread / np.maximum(near, 1e-9), 0, 1)) + 1e-9, 4.0)
-    low = bearing + np.minimum(arc, 0.0) - pad
-    width = np.minimum(np.abs(arc) + 2.0 * pad, 2.0 * np.pi)
-    low = angles[0] + np.mod(low - angles[0], 2.0 * np.pi)
-    low = np.concatenate([low, low - 2.0 * np.pi])  # the arc may pass the first ray's bearing
-    begin = np.searchsorted(angles, low, "left")
-    count = np.searchsorted(angles, low + np.tile(width, 2), "right") - begin
-    ends = np.cumsum(count)
-    ray = np.arange(ends[-1]) + np.repeat(begin - (ends - count), count)
-    return ray, np.repeat(np.tile(np.arange(len(segments)), 2), count)
-
-
-def blocked(segments: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Whether a segment crosses the straight line from start to end, both (n, 2) [m]; (n,) bool."""
-    a, along = segments[None, :, :2], segments[None, :, 2:] - segments[None, :, :2]
-    line = (end - start)[:, None]
-    to_a = a - start[:, None]
-    det = _cross(line, along)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        t, u = _cross(to_a, along) / det, _cross(to_a, line) / det
-    return np.any((t > 0.0) & (t < 1.0) & (u >= 0.0) & (u <= 1.0), axis=1)
-
-
-def point_segment_distance(points: np.ndarray, segments: np.ndarray) -> np.ndarray:
-    """Distance of points (n, 2) from segments (S, 4), (n, S) [m]."""
-    a, along = segments[:, :2], segments[:, 2:] - segments[:, :2]
-    length2 = np.maximum(np.sum(along**2, -1), 1e-30)
-    share = np.clip(np.sum((points[:, None] - a) * along, -1) / length2, 0.0, 1.0)
-    return np.hypot(*np.moveaxis(points[:, None] - a - share[..., None] * along, -1, 0))
+# What is where --------------------------------------------------------------------------------------------------------
 
 
 def inside(outline: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -138,11 +70,6 @@ def _enclosed(segments: np.ndarray, points: np.ndarray) -> np.ndarray:
     straddles = (y1 > y) != (y2 > y)
     crossed = straddles & (x < x1 + (y - y1) * (x2 - x1) / np.where(y1 == y2, 1.0, y2 - y1))
     return np.sum(crossed, axis=1) % 2 == 1
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """z of the cross product of (..., 2) vectors."""
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
 # Building blocks -----------------------------------------------------------------------------------------------------

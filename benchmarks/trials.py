@@ -1,0 +1,140 @@
+"""One scenario and seed through simulator and estimator: its figures, and the Trial that the checks judge."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.checks import NAN, Trial, rms_outside
+from benchmarks.intervals import disturbed
+from benchmarks.sharpness import occupied, own_fit, sharpness, stray, wall_distances
+from uwbslam_jax.conditions import Scenario
+from uwbslam_jax.measurements import Message
+from uwbslam_jax.metrics import RigidMotion, Truth, align, consistency, evaluate, wrap
+from uwbslam_jax.result import MapImage, Result
+from uwbslam_jax.run import run_messages
+from uwbslam_jax.settings_file import from_dict
+from uwbslam_jax.simulate import START_NS, settings_overrides, simulate
+
+_MEMORY_SAMPLES = 100
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A run's result with the truth, and what was made of both.
+
+    Attributes:
+      result, truth: of the run.
+      motion: from the published frame into the truth's, fitted where the robot is not disturbed.
+      trial: what the checks judge.
+      figures: name -> number, see `measure`.
+    """
+
+    result: Result
+    truth: Truth
+    motion: RigidMotion
+    trial: Trial
+    figures: dict[str, Any]
+
+
+class _Watched:
+    """Messages of a run, and how much memory the process uses as they are read, for the last time that they are."""
+
+    def __init__(self, messages: Sequence[Message]):
+        self._messages = messages
+        self.memory: list[float] = []
+
+    def __iter__(self) -> Iterator[Message]:
+        self.memory = []
+        every = max(len(self._messages) // _MEMORY_SAMPLES, 1)
+        for count, message in enumerate(self._messages):
+            if count % every == 0:
+                self.memory.append(resident_mb())
+            yield message
+
+
+def resident_mb() -> float:
+    """Memory that this process holds now [MB], NaN where the system does not tell as Linux does."""
+    told = Path("/proc/self/statm")
+    return int(told.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20 if told.exists() else NAN
+
+
+def measure(scenario: Scenario) -> Outcome:
+    """Simulates, runs with the defaults and compares.
+
+    The figures are robot_rmse_m (where the robot is not disturbed), robot_max_m, heading_deg_median, beacon_mean_m,
+    beacon_max_m, beacons_missing, covered, decided_s, sharpness, own_sharpness, stray, real_time_factor, peak_rss_mb,
+    pose_nees_ratio and beacon_nees_ratio; NaN where there is nothing to compare.
+    """
+    messages = _Watched(list(simulate(scenario)))
+    result, truth = run_messages(messages, from_dict(settings_overrides(scenario)))
+    assert truth is not None
+    apart = disturbed(scenario)
+    beacons = {beacon.id: beacon.position for beacon in result.beacons}
+    motion = align(*_undisturbed(result, apart), beacons, truth)
+    trial = lay_over(result, truth, motion, messages.memory)
+    of_all = evaluate(result.stamps, result.poses, beacons, truth)
+    true = truth.beacon_positions()
+    off = [np.linalg.norm(motion.points(xy[None])[0] - true[node]) for node, xy in beacons.items() if node in true]
+    calm = ~trial.within(apart)
+    turned = np.abs(wrap(trial.poses[calm, 2] - trial.true[calm, 2]))
+    figures: dict[str, Any] = {key: of_all[key] for key in ("covered", "beacons_missing")}
+    figures |= {
+        "robot_rmse_m": rms_outside(trial, apart),
+        "robot_max_m": float(np.linalg.norm(trial.offset[calm], axis=1).max()),
+        "heading_deg_median": float(np.rad2deg(np.median(turned))),
+        "beacon_mean_m": float(np.mean(off)) if off else NAN,
+        "beacon_max_m": float(np.max(off)) if off else NAN,
+    }
+    figures |= _of_the_map(result.map, motion, scenario.world.segments)
+    figures |= {"decided_s": trial.decided}
+    figures |= {key: result.summary[key] for key in ("real_time_factor", "peak_rss_mb")}
+    figures |= consistency(result, truth)
+    return Outcome(result, truth, motion, trial, figures)
+
+
+def _of_the_map(image: MapImage, motion: RigidMotion, walls: np.ndarray) -> dict[str, float]:
+    """sharpness where the run's fit puts the map; own_sharpness and stray where the map itself fits best."""
+    cells = occupied(image, motion)
+    distances = wall_distances(cells, walls)
+    own = wall_distances(own_fit(cells, walls).points(cells), walls)
+    size = image.resolution
+    return {"sharpness": sharpness(distances, size), "own_sharpness": sharpness(own, size), "stray": stray(own)}
+
+
+def _undisturbed(result: Result, apart: Iterable[tuple[float, float]]) -> tuple[np.ndarray, np.ndarray]:
+    """Stamps and poses that the fit may use."""
+    t = (result.stamps - START_NS) / 1e9
+    use = np.ones(t.shape, bool)
+    for begin, end in apart:
+        use &= (t < begin) | (t >= end)
+    return result.stamps[use], result.poses[use]
+
+
+def lay_over(result: Result, truth: Truth, motion: RigidMotion, memory: Sequence[float] = ()) -> Trial:
+    """What a run published, moved into the frame of the truth, in seconds since the simulation's start."""
+    began = (result.stamps[0] - START_NS) / 1e9
+    decided = result.summary["decided_at"]
+
+    def moved(track: np.ndarray) -> np.ndarray:
+        return np.column_stack([track[:, 0] + began, motion.points(track[:, 1:3])])
+
+    def timed(track: np.ndarray) -> np.ndarray:
+        return np.column_stack([(track[:, 0] - START_NS) / 1e9, track[:, 1:]])
+
+    return Trial(
+        t=(result.stamps - START_NS) / 1e9,
+        poses=motion.poses(result.poses),
+        true=truth.poses_at(result.stamps),
+        beacons={node: moved(track) for node, track in result.beacon_tracks.items()},
+        true_beacons={node: timed(track) for node, track in truth.beacons.items()},
+        decided=NAN if decided is None else began + decided,
+        hypotheses=result.diagnostics["hypotheses"],
+        warnings=tuple(result.summary["warnings"]),
+        memory=np.asarray(memory, float),
+    )

@@ -1,0 +1,40 @@
+"""The scenario suite in a smaller form: two seeds, shortened recordings, every third beam, the suite's own bars.
+
+Seed 0 laps counter-clockwise and seed 1 clockwise. The whole suite is `python -m benchmarks.scenarios`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from benchmarks.suite import ROWS
+from benchmarks.trials import measure
+from uwbslam_jax.simulate import scenario
+
+BEAMS = 361
+"""One size for all scenarios: the step is compiled once."""
+
+SHORT = {
+    "hall": (40.0, ROWS["hall"]),
+    "straight": (30.0, ROWS["straight"]),
+    # half of the suite's ranges, and no lap that ends where it began
+    "nlos_silent": (40.0, replace(ROWS["nlos_silent"], robot=0.08)),
+    "early": (62.0, ROWS["early"]),  # a stretch and ten seconds after it
+    "frame_moved": (50.0, ROWS["frame_moved"]),
+    "blind": (40.0, ROWS["blind"]),
+    "kidnapped": (40.0, ROWS["kidnapped"]),
+}
+"""Scenario -> how long [s], and what is asked."""
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("name", SHORT)
+def test_a_short_form_of_the_scenario_holds_its_bar(name: str, seed: int) -> None:
+    duration, row = SHORT[name]
+    made = scenario(name, seed, duration)
+    made = replace(made, lidar=replace(made.lidar, beams=BEAMS))
+    outcome = measure(made)
+    found = {check.name: check.measure(outcome.trial, made) for check in row.checks}
+    assert row.shortfalls(outcome.figures, found) == []
