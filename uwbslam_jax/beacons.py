@@ -1,33 +1,47 @@
-"""A beacon's life after start-up (DESIGN 1.7): joining, falling silent, being carried away, coming back.
+"""A beacon's life after start-up (DESIGN 1.7): joining, falling silent, being carried, coming back; the robot's too.
 
-Host code that looks at a few frames at a time. A beacon that is not in the state is placed from a short buffer of
-ranges to nodes of known position, when its place is unique and certain; one whose ranges stop fitting, or that is
-not heard for long, leaves the state and may come back the same way.
+Host code that looks at a few frames at a time. A beacon that is not in the state is placed from its newest ranges to
+nodes of known place, at rest or carried, when they leave one place only. One whose ranges say that it moves is taken
+to be carried, until they say that it rests; one that is not heard for long leaves the state.
 """
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass, field
 
-import jax.numpy as jnp
 import numpy as np
 
-from uwbslam_jax import layout
+from uwbslam_jax import beacon_state, layout, ranging
 from uwbslam_jax.config import Params, Settings
-from uwbslam_jax.ekf import Gaussian
 from uwbslam_jax.measurements import Ranges, StampedFrame
 from uwbslam_jax.multilateration import locate
-from uwbslam_jax.placement import rotation
+from uwbslam_jax.sightings import (
+    DISTANCE,
+    MEMORY_S,
+    NORMALISED,
+    OTHER,
+    Known,
+    Sightings,
+    Verdict,
+    carried_place,
+    judge,
+    resting_elsewhere,
+    resting_place,
+)
 from uwbslam_jax.slam import Estimate, State
 
-_BUFFER_S = 12.0
-_FEWEST_RANGES = 12
 _SILENT_S = 3.0
 _DROP_S = 60.0
+_SILENT_WALK = 0.01
+"""Random walk of the place of a beacon that is not heard: somebody may push it [m/s^0.5]."""
+_DOUBTED_S = 5.0
+"""Ranges that do not fit for so long are told about."""
+_LOST_M = 3.0
+"""A carried beacon that is known no better than this has been lost."""
+_WATCHED_S = 2.0
+"""Of a beacon whose ranges fit, so much is remembered."""
 _MISFIT = 4.0
-"""Median absolute normalised innovation of a node's ranges beyond which it is not where the state has it."""
-_MISFIT_S = 1.0
+"""Median absolute normalised innovation of a node's ranges to the robot beyond which they do not fit."""
 _CARRIED_SHARE = 0.4
 _FOUND_SHARE = 0.7
 """When the robot's ranges to so many of the beacons stop fitting at once, and one other place explains so many of
@@ -36,18 +50,19 @@ _CARRIED_S = 0.5
 _NEWEST = 4
 """So many of a beacon's newest ranges place a robot that was carried."""
 
+Event = tuple[int, str]
+
 
 @dataclass
 class _Life:
-    """What the host knows of one slot. heard: stamp [ns]; anchors: (stamp, known place, distance) of a node yet to be
-    placed; misfits: (stamp, absolute normalised innovation); from_robot: the same of the robot's ranges, with the
-    distance [m]."""
+    """What the host knows of one slot. heard: when last [s]; doubted: since when its ranges do not fit [s], None where
+    they do; told: whether that was told."""
 
     status: str = "waiting"
-    heard: int = 0
-    anchors: deque[tuple[int, np.ndarray, float]] = field(default_factory=deque)
-    misfits: deque[tuple[int, float]] = field(default_factory=deque)
-    from_robot: deque[tuple[int, float, float]] = field(default_factory=deque)
+    heard: float = 0.0
+    doubted: float | None = None
+    told: bool = False
+    sightings: Sightings = field(default_factory=Sightings)
 
 
 class BeaconKeeper:
@@ -57,6 +72,7 @@ class BeaconKeeper:
         self._nlos_gap_db = settings.uwb.nlos_gap_db
         self._sigma_n = settings.uwb.sigma_n
         self._lives: dict[int, _Life] = {}
+        self._start: int | None = None
 
     def status(self, slot: int) -> str:
         """static, moving, silent, dropped or waiting."""
@@ -65,151 +81,189 @@ class BeaconKeeper:
     def placed(self, slot: int, stamp: int) -> None:
         """Start-up has put a beacon into the state."""
         life = self._life(slot)
-        life.status, life.heard = "static", stamp
-        life.anchors.clear()
+        life.status, life.heard = "static", self._seconds(stamp)
 
     def _life(self, slot: int) -> _Life:
         return self._lives.setdefault(slot, _Life())
 
+    def _seconds(self, stamp: int) -> float:
+        self._start = stamp if self._start is None else self._start
+        return (stamp - self._start) / 1e9
+
     def look(
         self, state: State, params: Params, pending: list[tuple[StampedFrame, Estimate]]
-    ) -> tuple[State, list[tuple[int, str]]]:
+    ) -> tuple[State, list[Event]]:
         """The state after what a few frames told about the beacons, and what happened to which slot."""
-        for frame, estimate in pending:
-            self._listen(frame, estimate, params)
-        now = pending[-1][0].stamp
-        events: list[tuple[int, str]] = []
-        for life in self._lives.values():
-            for buffer in (life.anchors, life.misfits, life.from_robot):
-                while buffer and now - buffer[0][0] > _BUFFER_S * 1e9:
-                    buffer.popleft()
-        share, found = self._find_carried_robot(state, now)
-        if share > _FOUND_SHARE or found is not None:
-            for life in self._lives.values():
-                life.misfits.clear()  # so many at once are not the beacons' fault
+        self._listen(pending, params)
+        span = self._seconds(pending[-1][0].stamp) - self._seconds(pending[0][0].stamp)
+        now = self._seconds(pending[-1][0].stamp)
+        share, found = self._find_carried_robot(state, self._known(state, now, 0))
         if found is not None:
-            return _put_robot(state, found), [(0, "was carried: found again by its ranges")]
+            for life in self._lives.values():
+                life.sightings.forget(other=0)
+            return beacon_state.put_robot(state, found), [(0, "was carried: found again by its ranges")]
+        events: list[Event] = []
         for slot, life in sorted(self._lives.items()):
-            if life.status in ("static", "silent"):
-                state = self._watch(state, slot, life, now, events)
-            else:
-                state = self._try_to_place(state, params, slot, life, events)
+            known = self._known(state, now, slot)
+            if life.status in ("waiting", "dropped"):
+                state = self._try_to_place(state, known, slot, life, events)
+            elif life.status == "moving":
+                state = self._follow(state, known, slot, life, events)
+            elif share <= _FOUND_SHARE:  # so many at once are not the beacons' fault
+                state = self._watch(state, known, slot, life, span, events)
+            trusted = life.status in ("static", "silent") and life.doubted is None
+            life.sightings.forget(before=now - (_WATCHED_S if trusted else MEMORY_S))
         return state, events
 
-    def _listen(self, frame: StampedFrame, estimate: Estimate, params: Params) -> None:
-        """Remember each usable range to a beacon: how it fits, or what it says about a place yet unknown."""
-        r = frame.frame.ranges
-        pose = np.asarray(estimate.pose, float)
-        for k in map(int, np.flatnonzero(r.valid & ~(r.power_gap > self._nlos_gap_db))):
-            i, j = int(r.i[k]), int(r.j[k])
-            for slot, other in ((i, j), (j, i)):
-                if slot == 0:
-                    continue
-                life = self._life(slot)
-                life.heard = frame.stamp
-                if estimate.active[slot]:
-                    if estimate.active[other]:
-                        misfit = abs(float(estimate.normalised[k]))
-                        life.misfits.append((frame.stamp, misfit))
-                        if other == 0:
-                            life.from_robot.append((frame.stamp, misfit, _flat(r, k, slot, other, params)))
-                elif estimate.active[other]:
-                    place = self._place_of(other, pose, estimate, float(r.age[k]), params)
-                    life.anchors.append((frame.stamp, place, _flat(r, k, slot, other, params)))
+    def _known(self, state: State, now: float, slot: int) -> Known:
+        k = state.active.shape[0]
+        mean, P = np.asarray(state.belief.mean, float), np.asarray(state.belief.cov, float)
+        variance = np.max(np.diag(P)[: 2 * k].reshape(k, 2), axis=1)
+        variance[0] = 0.0  # the robot's track is taken as a whole, see beacon_state.place
+        trusted = np.asarray(state.active) & ~np.asarray(state.moving)
+        trusted[[slot for slot, life in self._lives.items() if life.doubted is not None]] = False
+        noise = self._sigma_n * np.asarray(ranging.loudness(state.scatter.log[slot]), float)
+        return Known(mean[: 2 * k].reshape(k, 2), variance, trusted, self._sigma_n, noise, now)
 
-    def _find_carried_robot(self, state: State, now: int) -> tuple[float, np.ndarray | None]:
-        """Share of the beacons that the robot's ranges do not fit, and where the robot is by its ranges alone when
-        they say that it is not where the state has it."""
-        anchors, distance, misfit = [], [], []
-        mean, active = np.asarray(state.belief.mean, float), np.asarray(state.active)
-        for slot, life in self._lives.items():
-            recent = [row for row in life.from_robot if now - row[0] < _CARRIED_S * 1e9]
-            if len(recent) < 2 or not active[slot]:
-                continue
-            misfit.append(float(np.median([row[1] for row in recent])) > _MISFIT)
-            newest = recent[-_NEWEST:]
-            anchors += [mean[2 * slot : 2 * slot + 2]] * len(newest)
-            distance += [row[2] for row in newest]
-        share = float(np.mean(misfit)) if len(misfit) >= 3 else 0.0
-        if share < _CARRIED_SHARE:
-            return share, None
-        # the newest ranges were taken on the move: a few decimetres are as good as they get
-        found = locate(np.array(anchors), np.array(distance), np.full(len(distance), 2 * self._sigma_n))
+    def _listen(self, pending: list[tuple[StampedFrame, Estimate]], params: Params) -> None:
+        """Remember each usable range to a node of known place."""
+        heard: dict[int, list[np.ndarray]] = {}
+        for frame, estimate in pending:
+            r, now = frame.frame.ranges, self._seconds(frame.stamp)
+            k = np.flatnonzero(np.asarray(r.valid) & ~(np.asarray(r.power_gap) > self._nlos_gap_db))
+            i, j = np.asarray(r.i)[k], np.asarray(r.j)[k]
+            age = np.asarray(r.age, float)[k]
+            known = np.asarray(estimate.active) & ~np.asarray(estimate.moving)
+            antenna = _antenna(estimate, age, params)
+            columns = [now + age, i, *antenna.T, _flat(r, k, params), np.asarray(estimate.normalised, float)[k]]
+            for node, other in ((i, j), (j, i)):
+                columns[OTHER] = other
+                rows = np.stack(columns, axis=1)[known[other]]
+                for slot in np.unique(node):
+                    if slot > 0:
+                        self._life(int(slot)).heard = now
+                        heard.setdefault(int(slot), []).append(rows[node[known[other]] == slot])
+        for slot, parts in heard.items():
+            rows = np.concatenate(parts)
+            if len(rows):
+                self._life(slot).sightings.add(rows)
+
+    def _try_to_place(self, state: State, known: Known, slot: int, life: _Life, events: list[Event]) -> State:
+        resting = resting_place(life.sightings, known)
+        found = resting or carried_place(life.sightings, known)
         if found is None:
-            return share, None
-        left = np.abs(np.linalg.norm(np.array(anchors) - found[0], axis=1) - distance)
-        return share, found[0] if np.mean(left < _MISFIT * self._sigma_n) > _FOUND_SHARE else None
+            return state
+        self._enter(slot, life, "moving" if resting is None else "static", known)
+        events.append((slot, "placed while it is carried" if resting is None else "placed"))
+        return beacon_state.place(state, slot, *found, moving=resting is None)
 
-    @staticmethod
-    def _place_of(slot: int, pose: np.ndarray, estimate: Estimate, age: float, params: Params) -> np.ndarray:
-        if slot > 0:
-            return np.asarray(estimate.beacons[slot], float)
-        heading = pose[2] + age * float(estimate.yaw_rate)
-        return pose[:2] + age * np.asarray(estimate.velocity) + rotation(heading) @ np.asarray(params.antenna, float)
+    def _enter(self, slot: int, life: _Life, status: str, known: Known) -> None:
+        """A beacon is at a new place: what was ranged to or from its old one is of no use."""
+        life.status, life.doubted, life.told = status, None, False
+        life.sightings.forget(before=known.now - 1.0)
+        for other in self._lives.values():
+            other.sightings.forget(other=slot)
 
-    def _watch(self, state: State, slot: int, life: _Life, now: int, events) -> State:
-        quiet = (now - life.heard) / 1e9
+    def _follow(self, state: State, known: Known, slot: int, life: _Life, events: list[Event]) -> State:
+        """A beacon that is being carried: rests, is followed, or is lost."""
+        resting = resting_place(life.sightings, known)
+        if resting is not None:
+            self._enter(slot, life, "static", known)
+            events.append((slot, "was put down: rests at a new place"))
+            return beacon_state.place(state, slot, *resting, moving=False)
+        quiet = known.now - life.heard
+        if quiet > _SILENT_S or known.variance[slot] > _LOST_M**2:
+            life.status = "waiting"
+            events.append((slot, "fell silent while it was carried" if quiet > _SILENT_S else "was lost while carried"))
+            return beacon_state.remove(state, slot)
+        velocity = np.asarray(layout.unpack(state.belief.mean).velocities[slot], float)
+        verdict = judge(life.sightings, known, slot, velocity)
+        if verdict.carried is not None:
+            return beacon_state.place(state, slot, verdict.carried, verdict.rows, moving=True)
+        return state
+
+    def _watch(self, state: State, known: Known, slot: int, life: _Life, span: float, events: list[Event]) -> State:
+        """A beacon that rests: is it still there, and heard?"""
+        quiet = known.now - life.heard
         if quiet > _DROP_S:
             life.status = "dropped"
             events.append((slot, "dropped: not heard for a minute"))
-            return _without(state, slot)
+            return beacon_state.remove(state, slot)
         if (quiet > _SILENT_S) != (life.status == "silent"):
             life.status = "silent" if quiet > _SILENT_S else "static"
             events.append((slot, "fell silent" if life.status == "silent" else "is heard again"))
-        recent = [z for stamp, z in life.misfits if now - stamp < _MISFIT_S * 1e9]
-        if len(recent) >= 5 and float(np.median(recent)) > _MISFIT:
-            life.status = "moving"
-            life.anchors.clear()
-            events.append((slot, "is not where it was: placed anew"))
-            return _without(state, slot)
+        if life.status == "silent":
+            return beacon_state.loosen(state, slot, _SILENT_WALK**2 * span)
+        verdict = judge(life.sightings, known, slot, np.zeros(2))
+        if verdict.carried is not None:
+            self._enter(slot, life, "moving", known)
+            events.append((slot, "is being carried"))
+            return beacon_state.place(state, slot, verdict.carried, verdict.rows, moving=True)
+        return self._doubt(state, known, slot, life, verdict, events)
+
+    def _doubt(
+        self, state: State, known: Known, slot: int, life: _Life, verdict: Verdict, events: list[Event]
+    ) -> State:
+        """A beacon whose ranges fit neither its place nor a motion: a clock, walls, or only the robot hears it."""
+        if verdict.fits:
+            if life.told:
+                events.append((slot, "ranges fit again"))
+            life.doubted, life.told = None, False
+            return state
+        if life.doubted is None:
+            life.doubted = known.now
+            life.sightings.forget(before=known.now - 1.0)  # what it ranged from its old place
+        elsewhere = resting_elsewhere(life.sightings, known, slot)
+        if elsewhere is not None:
+            self._enter(slot, life, "static", known)
+            events.append((slot, "was moved: rests at a new place"))
+            return beacon_state.place(state, slot, *elsewhere, moving=False)
+        if known.now - life.doubted > _DOUBTED_S and not life.told:
+            life.told = True
+            events.append((slot, f"ranges do not fit ({verdict.bias:+.1f} m): a clock, walls, or it was moved"))
         return state
 
-    def _try_to_place(self, state: State, params: Params, slot: int, life: _Life, events) -> State:
-        if len(life.anchors) < _FEWEST_RANGES:
-            return state
-        anchors = np.array([a[1] for a in life.anchors])
-        distance = np.array([a[2] for a in life.anchors])
-        place = locate(anchors, distance, np.full(len(distance), self._sigma_n))
-        if place is None:
-            return state
-        life.status = "static"
-        life.anchors.clear()
-        life.misfits.clear()
-        events.append((slot, "placed"))
-        return _with(state, slot, *place)
+    def _find_carried_robot(self, state: State, known: Known) -> tuple[float, np.ndarray | None]:
+        """Share of the resting beacons that the robot's ranges do not fit, and where the robot is by its ranges alone
+        when they say that it is not where the state has it."""
+        active = np.asarray(state.active)
+        rows, misfit = [], []
+        for slot, life in self._lives.items():
+            if not active[slot] or life.status != "static":
+                continue
+            recent = life.sightings.since(known.now - _CARRIED_S)
+            recent = recent[recent[:, OTHER] == 0]
+            if len(recent) < 2 or known.noise[slot] > self._sigma_n:
+                continue
+            misfit.append(float(np.median(np.abs(recent[:, NORMALISED]))) > _MISFIT)
+            rows.append(
+                np.column_stack([np.tile(known.places[slot], (len(recent), 1)), recent[:, DISTANCE]])[-_NEWEST:]
+            )
+        share = float(np.mean(misfit)) if len(misfit) >= 3 else 0.0
+        if share < _CARRIED_SHARE:
+            return share, None
+        anchors, distance = np.concatenate(rows)[:, :2], np.concatenate(rows)[:, 2]
+        # the newest ranges were taken on the move: a few decimetres are as good as they get
+        found = locate(anchors, distance, np.full(len(distance), 2 * self._sigma_n))
+        if found is None:
+            return share, None
+        left = np.abs(np.linalg.norm(anchors - found[0], axis=1) - distance)
+        return share, found[0] if np.mean(left < _MISFIT * self._sigma_n) > _FOUND_SHARE else None
 
 
-def _flat(r: Ranges, k: int, i: int, j: int, params: Params) -> float:
-    """Distance in the plane of one range between two slots, biases and heights taken off [m]."""
-    rise = float(params.height[i] - params.height[j])
-    slant = float(r.range[k] - params.bias[i] - params.bias[j])
-    return float(np.sqrt(max(slant**2 - rise**2, 0.01)))
+def _antenna(estimate: Estimate, age: np.ndarray, params: Params) -> np.ndarray:
+    """(R, 2) where the robot's antenna was at each exchange [m]."""
+    pose = np.asarray(estimate.pose, float)
+    heading = pose[2] + float(estimate.yaw_rate) * age
+    x, y = np.asarray(params.antenna, float)
+    c, s = np.cos(heading), np.sin(heading)
+    lever = np.stack([c * x - s * y, s * x + c * y], axis=1)
+    return pose[:2] + age[:, None] * np.asarray(estimate.velocity, float) + lever
 
 
-def _put_robot(state: State, position: np.ndarray) -> State:
-    """The state with the robot somewhere else: at rest, heading unknown, the map where it was."""
-    k = state.active.shape[0]
-    rows = jnp.array([0, 1, 2 * k, 2 * k + 1, 4 * k, 4 * k + 1, *layout.map_error_indices(k)])
-    variance = jnp.array([0.3**2, 0.3**2, 1.0, 1.0, 10.0, 1.0, 0.05**2, 0.05**2, 0.01**2])
-    mean = state.belief.mean.at[rows].set(0.0).at[:2].set(jnp.asarray(position, jnp.float32))
-    mean = mean.at[4 * k].set(state.belief.mean[4 * k])
-    P = state.belief.cov.at[rows, :].set(0.0).at[:, rows].set(0.0).at[rows, rows].set(variance)
-    return state._replace(belief=Gaussian(mean, P))
-
-
-def _with(state: State, slot: int, position: np.ndarray, cov: np.ndarray) -> State:
-    """The state with a beacon put in, independent of the rest."""
-    k = state.active.shape[0]
-    at, velocity = jnp.array([2 * slot, 2 * slot + 1]), jnp.array([2 * (k + slot), 2 * (k + slot) + 1])
-    mean = state.belief.mean.at[at].set(jnp.asarray(position, jnp.float32)).at[velocity].set(0.0)
-    P = state.belief.cov
-    for rows in (at, velocity):
-        P = P.at[rows, :].set(0.0).at[:, rows].set(0.0)
-    P = P.at[at[:, None], at[None, :]].set(jnp.asarray(cov, jnp.float32)).at[velocity, velocity].set(1e-8)
-    return state._replace(belief=Gaussian(mean, P), active=state.active.at[slot].set(True))
-
-
-def _without(state: State, slot: int) -> State:
-    """The state without a beacon; its row of the covariance becomes that of an empty slot."""
-    state = _with(state, slot, np.zeros(2), np.eye(2))
-    return state._replace(active=state.active.at[slot].set(False))
+def _flat(r: Ranges, k: np.ndarray, params: Params) -> np.ndarray:
+    """(R,) distances in the plane of the ranges k of a frame, biases and heights taken off [m]."""
+    i, j = np.asarray(r.i)[k], np.asarray(r.j)[k]
+    height, bias = np.asarray(params.height, float), np.asarray(params.bias, float)
+    slant = (np.asarray(r.range, float)[k] - bias[i] - bias[j]) / (1.0 + float(params.bias_scale))
+    return np.sqrt(np.maximum(slant**2 - (height[i] - height[j]) ** 2, 0.01))

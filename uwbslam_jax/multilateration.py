@@ -1,6 +1,8 @@
-"""One node from ranges to known points: its best place, the second best, whether the best is certain (float64)."""
+"""One node from ranges to known points, at rest or carried: its best place, the second best, how certain (float64)."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,6 +14,42 @@ DECIDED = 15.0
 """Difference of log-likelihood that decides between two explanations."""
 SIGMA_ENOUGH_M = 0.15
 """A beacon enters when its position is known this well among the others."""
+WALK_M_S = 1.0
+"""Standard deviation of each component of the velocity of somebody who carries a beacon."""
+_APART_M = 0.5
+"""Two places closer than this are one."""
+_AT_REST = 1e-6
+_MOVES = 12
+_ENOUGH = 1e-3
+"""A place is settled when a move gains less log-likelihood than this."""
+
+
+class Spot(NamedTuple):
+    """Where a node is by its ranges.
+
+    Attributes:
+      place: (2,) at time 0 [m].
+      velocity: (2,) [m/s].
+      cov: (4, 4) of both.
+      cost: negative log-likelihood (Geman-McClure).
+      pull: (R, 4, 2) how place and velocity follow when an anchor moves.
+    """
+
+    place: np.ndarray
+    velocity: np.ndarray
+    cov: np.ndarray
+    cost: float
+    pull: np.ndarray
+
+    @property
+    def sigma(self) -> float:
+        """Largest standard deviation of the place [m]."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.cov[:2, :2])[-1]))
+
+    @property
+    def speed_sigma(self) -> float:
+        """Largest standard deviation of the velocity [m/s]."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.cov[2:, 2:])[-1]))
 
 
 def multilaterate(anchors: np.ndarray, distance: np.ndarray, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -24,47 +62,153 @@ def multilaterate(anchors: np.ndarray, distance: np.ndarray, sigma: np.ndarray) 
     first = np.argmin(sigma)
     angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     spots = anchors[first] + distance[first] * np.stack([np.cos(angle), np.sin(angle)], -1)
-    cost = np.zeros(len(spots))
-    for _ in range(12):  # Gauss-Newton from every start at once
-        u = spots[:, None] - anchors
-        d = np.maximum(np.linalg.norm(u, axis=2), 1e-6)
-        r, scale = soften((d - distance) / sigma)
-        J = (scale / sigma / d)[..., None] * u
-        A = np.einsum("sri,srj->sij", J, J) + 1e-3 * np.eye(2)
-        move = np.linalg.solve(A, np.einsum("sri,sr->si", J, r)[..., None])[..., 0]
-        spots = spots - np.clip(move, -2.0, 2.0)
-        cost = 0.5 * (r**2).sum(1)
+    states, cost = _descend(spots, np.zeros(len(distance)), anchors, distance, sigma, _AT_REST)
     order = np.argsort(cost)
-    best = spots[order[0]]
-    apart = [k for k in order if np.linalg.norm(spots[k] - best) > 0.5]
-    return best, spots[apart[0]] if apart else best
+    best = states[order[0], :2]
+    apart = [k for k in order if np.linalg.norm(states[k, :2] - best) > _APART_M]
+    return best, states[apart[0], :2] if apart else best
+
+
+def fit(
+    starts: np.ndarray,
+    time: np.ndarray,
+    anchors: np.ndarray,
+    distance: np.ndarray,
+    sigma: np.ndarray,
+    *,
+    carried: bool,
+) -> list[Spot]:
+    """Places that explain the ranges, the best first; one of several that are the same.
+
+    Args:
+      starts: (S, 2) places to start from [m].
+      time: (R,) of the ranges; the place is that of time 0 [s].
+      anchors: (R, 2); distance, sigma: (R,) [m].
+      carried: whether the node may have a velocity, of `WALK_M_S`; otherwise it rests.
+    """
+    walk = WALK_M_S if carried else _AT_REST
+    states, cost = _descend(starts, time, anchors, distance, sigma, walk)
+    found: list[int] = []
+    for k in map(int, np.argsort(cost)):
+        if all(np.linalg.norm(states[k, :2] - states[other, :2]) > _APART_M for other in found):
+            found.append(k)
+    return [_spot(states[k], float(cost[k]), time, anchors, distance, sigma, walk) for k in found]
+
+
+def settle(place: np.ndarray, anchors: np.ndarray, distance: np.ndarray, sigma: np.ndarray, common: np.ndarray) -> Spot:
+    """The place of a node at rest, near a first guess, from ranges whose anchors err together.
+
+    Args:
+      place: (2,) the guess [m].
+      anchors: (R, 2); distance, sigma: (R,) [m].
+      common: (R, R) covariance of the anchors' errors, the same in every direction [m^2]. It makes ranges from about
+        one direction nearly one range.
+    """
+    here = _Settled.at(place, anchors, distance, sigma, common)
+    damping = 1e-3
+    for _ in range(2 * _MOVES):
+        A = here.u.T @ here.W @ here.u
+        move = np.linalg.solve(A + (damping * np.trace(A) + 1e-6) * np.eye(2), here.u.T @ here.W @ here.r)
+        there = _Settled.at(here.place - move, anchors, distance, sigma, common)
+        gain = here.cost - there.cost
+        here, damping = (there, damping / 5) if gain > 0 else (here, damping * 10)
+        if 0 < gain < _ENOUGH or damping > 1e3:
+            break
+    cov = np.linalg.inv(here.u.T @ here.W @ here.u + 1e-6 * np.eye(2))
+    both = np.zeros((4, 4))
+    both[:2, :2], both[2:, 2:] = cov, _AT_REST**2 * np.eye(2)
+    pull = np.zeros((len(distance), 4, 2))
+    pull[:, :2] = (cov @ here.u.T @ here.W).T[:, :, None] * here.u[:, None]
+    return Spot(here.place, np.zeros(2), both, here.cost, pull)
+
+
+class _Settled(NamedTuple):
+    """A place (2,) with the residuals (R,), unit vectors (R, 2) and weights (R, R) of its ranges, and its cost."""
+
+    place: np.ndarray
+    r: np.ndarray
+    u: np.ndarray
+    W: np.ndarray
+    cost: float
+
+    @staticmethod
+    def at(place, anchors, distance, sigma, common) -> _Settled:
+        u = _unit(place, anchors)
+        r = np.linalg.norm(place - anchors, axis=1) - distance
+        together = (u @ u.T) * common
+        # an outlier is one by itself: its own noise is what is raised (Black, Rangarajan 1996)
+        doubt = 1.0 + r**2 / (_SOFT**2 * (sigma**2 + np.diag(together)))
+        W = np.linalg.inv(np.diag(sigma**2 * doubt**2) + together)
+        return _Settled(place, r, u, W, 0.5 * float(r @ W @ r + _SOFT**2 * np.sum((1.0 - 1.0 / doubt) ** 2)))
+
+
+def mirrored(place: np.ndarray, anchors: np.ndarray) -> np.ndarray:
+    """A place (2,) on the other side of the line that the anchors (R, 2) are nearest to [m]."""
+    middle = anchors.mean(0)
+    normal = np.linalg.svd(anchors - middle)[2][1]
+    return place - 2 * ((place - middle) @ normal) * normal
+
+
+def _unit(place: np.ndarray, anchors: np.ndarray) -> np.ndarray:
+    u = place - anchors
+    return u / np.maximum(np.linalg.norm(u, axis=1), 1e-6)[:, None]
+
+
+def misfit(spot: np.ndarray, anchors: np.ndarray, distance: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """(R,) negative log-likelihood (Geman-McClure) of each range, from places (2,) or (R, 2) [m]."""
+    r, _ = soften((np.linalg.norm(spot - anchors, axis=1) - distance) / sigma)
+    return 0.5 * r**2
 
 
 def locate(anchors: np.ndarray, distance: np.ndarray, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Place (2,) and covariance (2, 2) of a node from ranges to known points, None where they do not determine it.
+    """Place (2,) and covariance (2, 2) of a node at rest from ranges to known points, None where they do not
+    determine it.
 
     Args:
       anchors: (R, 2) [m]; distance, sigma: (R,) [m].
     """
-    best, second = multilaterate(anchors, distance, sigma)
-    cost, cov = _fit(best, anchors, distance, sigma)
-    if np.sqrt(np.linalg.eigvalsh(cov)[-1]) > SIGMA_ENOUGH_M:
+    starts = np.stack(multilaterate(anchors, distance, sigma))
+    spot, *others = fit(starts, np.zeros(len(distance)), anchors, distance, sigma, carried=False)
+    if spot.sigma > SIGMA_ENOUGH_M or (others and others[0].cost - spot.cost < DECIDED):
         return None
-    other, _ = _fit(second, anchors, distance, sigma)
-    if np.linalg.norm(second - best) > 0.3 and other - cost < DECIDED:
-        return None
-    residual = np.linalg.norm(anchors - best, axis=1) - distance
+    residual = np.linalg.norm(anchors - spot.place, axis=1) - distance
     if np.median(np.abs(residual)) > 3 * np.median(sigma):
-        return None  # still being carried: no one place explains the ranges
-    return best, cov + RANGE_FLOOR_M**2 * np.eye(2)
+        return None  # no one place explains the ranges
+    return spot.place, spot.cov[:2, :2] + RANGE_FLOOR_M**2 * np.eye(2)
 
 
-def _fit(spot: np.ndarray, anchors: np.ndarray, distance: np.ndarray, sigma: np.ndarray) -> tuple[float, np.ndarray]:
-    u = spot - anchors
-    d = np.maximum(np.linalg.norm(u, axis=1), 1e-6)
+def _descend(starts, time, anchors, distance, sigma, walk: float) -> tuple[np.ndarray, np.ndarray]:
+    """States (S, 4) of place and velocity after Gauss-Newton from places (S, 2) at once, and their costs (S,)."""
+    states = np.column_stack([starts, np.zeros_like(starts)])
+    prior = np.array([0.0, 0.0, walk**-2, walk**-2])
+    cost = np.zeros(len(states))
+    for move_number in range(_MOVES + 1):
+        r, J = _linearise(states, time, anchors, distance, sigma)
+        cost = 0.5 * (r**2).sum(1) + 0.5 * (prior * states**2).sum(1)
+        if move_number == _MOVES:
+            break
+        A = np.einsum("sri,srj->sij", J, J) + np.diag(prior + 1e-3)
+        move = np.linalg.solve(A, (np.einsum("sri,sr->si", J, r) + prior * states)[..., None])[..., 0]
+        states = states - np.clip(move, -2.0, 2.0)
+    return states, cost
+
+
+def _linearise(states, time, anchors, distance, sigma) -> tuple[np.ndarray, np.ndarray]:
+    """Whitened residuals (S, R) and their Jacobian (S, R, 4)."""
+    u = states[:, None, :2] + time[:, None] * states[:, None, 2:] - anchors
+    d = np.maximum(np.linalg.norm(u, axis=2), 1e-6)
     r, scale = soften((d - distance) / sigma)
-    J = (scale / sigma / d)[:, None] * u
-    return 0.5 * float(r @ r), np.linalg.inv(J.T @ J + 1e-6 * np.eye(2))
+    J = (scale / sigma / d)[..., None] * u
+    return r, np.concatenate([J, time[:, None] * J], axis=2)
+
+
+def _spot(state, cost: float, time, anchors, distance, sigma, walk: float) -> Spot:
+    _, J = _linearise(state[None], time, anchors, distance, sigma)
+    J = J[0]
+    cov = np.linalg.inv(J.T @ J + np.diag([1e-6, 1e-6, walk**-2, walk**-2]))
+    # a residual depends on its anchor as on the place, with the other sign
+    pull = (J @ cov)[:, :, None] * J[:, None, :2]
+    return Spot(state[:2], state[2:], cov, cost, pull)
 
 
 def soften(whitened: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
