@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 
 from uwbslam_jax.config import Settings, UwbSettings
 from uwbslam_jax.frames import pad_scan
+from uwbslam_jax.keyframes import Buffer, Keyframe, Sighting
 from uwbslam_jax.measurements import Frame, Odometry, Ranges, StampedFrame
-from uwbslam_jax.placement import Keyframe
-from uwbslam_jax.startup import Buffer
 
 BEACONS = {1: np.array([-2.0, 4.0]), 2: np.array([6.0, 5.0]), 3: np.array([5.0, -3.0])}
 IDS = {0: 0, 1: 1, 2: 2, 3: 3}
@@ -42,23 +43,42 @@ def frame(stamp: int = 0) -> StampedFrame:
 
 
 def buffer(
-    poses: np.ndarray, *, beacons=BEACONS, each: int = 3, pairs: bool = True, seed: int = 0, antenna=(0.1, 0.05)
+    poses: np.ndarray,
+    *,
+    beacons=BEACONS,
+    each: int = 3,
+    pairs: bool = True,
+    seed: int = 0,
+    antenna=(0.1, 0.05),
+    bias=None,
 ) -> Buffer:
-    """What start-up has buffered: at every pose `each` noisy ranges to every beacon, and between beacons if `pairs`."""
+    """What start-up has buffered: at every pose `each` noisy ranges to every beacon, and between beacons if `pairs`.
+
+    bias: of each node by slot [m], the robot's is slot 0.
+    """
     rng = np.random.default_rng(seed)
+    bias = {0: 0.0, **dict.fromkeys(beacons, 0.0)} if bias is None else bias
     kept = Buffer(np.array(antenna), np.zeros(4), np.zeros(4), SIGMA_N)
     for k, pose in enumerate(poses):
         c, s = np.cos(pose[2]), np.sin(pose[2])
         place = pose[:2] + np.array([c * antenna[0] - s * antenna[1], s * antenna[0] + c * antenna[1]])
         information = np.diag([1 / 0.01**2, 1 / 0.01**2, 1 / 0.002**2])
-        key = Keyframe(frame(int(k * 3e8)), pose, information, np.zeros(2), 0.0)
+        stamp = int(k * 3e8)
+        kept.keyframes.append(Keyframe(frame(stamp), pose, information, np.zeros(2), 0.0))
         for slot, beacon in beacons.items():
-            d = np.linalg.norm(place - beacon) + SIGMA_N * rng.normal(size=each)
-            key.seen[slot] = [(np.array(antenna), float(x)) for x in d]
-        kept.keyframes.append(key)
+            d = np.linalg.norm(place - beacon) + bias[0] + bias[slot] + SIGMA_N * rng.normal(size=each)
+            kept.sightings.setdefault(slot, deque()).extend(Sighting(stamp, pose, float(x)) for x in d)
     for i in beacons:
         for j in beacons:
             if i < j and pairs:
-                d = np.linalg.norm(beacons[i] - beacons[j]) + SIGMA_N * rng.normal(size=each * len(poses))
-                kept.pairs[i, j] = list(map(float, d))
+                noise = SIGMA_N * rng.normal(size=each * len(poses))
+                d = np.linalg.norm(beacons[i] - beacons[j]) + bias[i] + bias[j] + noise
+                kept.pairs[i, j] = deque(map(float, d))
     return kept
+
+
+def forget(kept: Buffer, slot: int, since: int = 0, before: int = 10**9) -> None:
+    """Take the ranges to a beacon out of a buffer, from one keyframe's number to another's."""
+    own = range(since, min(before, len(kept.keyframes)))
+    stamps = {kept.keyframes[k].frame.stamp for k in own}
+    kept.sightings[slot] = deque(s for s in kept.sightings[slot] if s.stamp not in stamps)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import start_of_run
 from start_of_run import BEACONS, IDS, SETTINGS
 
-from uwbslam_jax import geometry, layout, slam, startup
+from uwbslam_jax import geometry, keyframes, layout, slam, startup
 from uwbslam_jax.config import make_config, make_params
 
 TRUTH = np.array(list(BEACONS.values()))
@@ -164,16 +166,15 @@ def test_covariance_of_the_velocity_turns_with_the_frame():
     np.testing.assert_allclose(P[np.ix_(MOTION, MOTION)], J @ MOTION_COV @ J.T, atol=1e-6)  # float32
 
 
-def test_earlier_poses_are_republished_with_the_keyframe_before_them():
+def test_earlier_poses_are_republished_with_the_keyframes_around_them():
     placement, _, _, adopted, _ = adopted_case()
     track = start_of_run.with_a_turn()
     np.testing.assert_allclose(adopted.republish(adopted.anchors, track), adopted.after, atol=1e-9)
-    # a pose between two keyframes keeps its place relative to the earlier one
-    later = track[3] + np.array([0.1, 0.02, 0.05])
-    moved = adopted.republish(adopted.anchors[3:4] + 1, later[None])
-    np.testing.assert_allclose(
-        startup.between(adopted.after[3:4], moved), startup.between(track[3:4], later[None]), atol=1e-9
-    )
+    # a pose between two keyframes keeps its place relative to both, the nearer one counting more
+    later = (track[3] + np.array([0.1, 0.02, 0.05]))[None]
+    quarter = adopted.anchors[3:4] + (adopted.anchors[4] - adopted.anchors[3]) // 4
+    ends = [startup.compose(adopted.after[k], startup.between(track[k], later)) for k in (3, 4)]
+    np.testing.assert_allclose(adopted.republish(quarter, later), 0.75 * ends[0] + 0.25 * ends[1], atol=1e-9)
     # before the first keyframe: by the first
     first = adopted.republish(np.array([adopted.anchors[0] - 5]), track[:1])
     np.testing.assert_allclose(first, adopted.after[:1], atol=1e-9)
@@ -188,23 +189,42 @@ def test_host_compose_and_between_are_those_of_the_device():
     np.testing.assert_allclose(startup.compose(a, startup.between(a, b)), b, atol=1e-12)
 
 
+def test_biased_radios_are_told():
+    assert solved(start_of_run.with_a_turn(8.0), each=10, bias={0: 0.5, 1: -0.6, 2: 0.8, 3: 0.7}).biased
+
+
+def test_calibrated_radios_are_not_called_biased():
+    assert not any(solved(start_of_run.with_a_turn(), seed=seed).biased for seed in range(5))
+
+
 def test_a_long_start_is_thinned_without_losing_ranges():
     kept = start_of_run.buffer(start_of_run.with_a_turn())
-    before = sum(len(seen) for key in kept.keyframes for seen in key.seen.values())
-    places = [_antennas(kept)]
-    count = len(kept.keyframes)
+    count, last = len(kept.keyframes), kept.newest
     kept._thin()
     assert count / 2 <= len(kept.keyframes) <= count / 2 + 2
-    assert sum(len(seen) for key in kept.keyframes for seen in key.seen.values()) == before
-    places.append(_antennas(kept))
-    np.testing.assert_allclose(*places, atol=1e-9)  # each range still stands where it was taken
+    assert kept.newest == last
+    averages = kept.averages(kept.keyframes)
+    # each range still stands where it was taken, half of them now half-way between two keyframes
+    poses = np.array([key.pose for key in kept.keyframes])
+    from_before = poses[averages.at, :2] + keyframes.turned(poses[averages.at, 2], averages.before)
+    after = np.minimum(averages.at + 1, len(poses) - 1)
+    from_after = poses[after, :2] + keyframes.turned(poses[after, 2], averages.after)
+    np.testing.assert_allclose(from_before, from_after, atol=1e-9)
+    assert set(np.round(averages.share, 6)) == {0.0, 0.5}
 
 
-def _antennas(kept) -> np.ndarray:
-    found = [
-        key.pose[:2] + startup.rotation(key.pose[2]) @ local
-        for key in kept.keyframes
-        for _, seen in sorted(key.seen.items())
-        for local, _ in seen
-    ]
-    return np.array(sorted(map(tuple, np.round(found, 9))))
+def test_scatter_tells_ranges_through_walls_from_quiet_ones():
+    kept = start_of_run.buffer(start_of_run.with_a_turn(), each=3)
+    rng = np.random.default_rng(0)
+    kept.sightings[2] = deque(s._replace(distance=s.distance + rng.exponential(0.8)) for s in kept.sightings[2])
+    kept.pairs[1, 3] = deque(d + rng.exponential(0.8) for d in kept.pairs[1, 3])
+    averages = kept.averages(kept.keyframes)
+    loud = averages.to == 2
+    assert np.median(averages.sigma[loud]) > 4 * np.median(averages.sigma[~loud])
+    medians = kept.pair_medians()
+    assert medians[1, 3][1] > 4 * max(medians[1, 2][1], medians[2, 3][1])
+    factor = np.exp(kept.scatter(4))
+    assert factor[0, 2] > 4
+    assert factor[1, 3] > 3
+    assert max(factor[0, 1], factor[0, 3], factor[1, 2], factor[2, 3]) < 1.6
+    np.testing.assert_array_equal(factor, factor.T)

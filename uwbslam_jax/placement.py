@@ -1,41 +1,23 @@
-"""The batch problem of start-up: keyframe poses and beacon positions from steps and ranges, in float64 on the host.
+"""The batch problem of start-up: keyframe poses, beacon positions and range biases from steps and ranges, in float64.
 
 Chains of poses with millimetre steps are beyond float32, and the problem runs once a second for some seconds only.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
-from uwbslam_jax.measurements import StampedFrame
-from uwbslam_jax.multilateration import DECIDED, RANGE_FLOOR_M, multilaterate, soften
+from uwbslam_jax.keyframes import Buffer, Keyframe, turned
+from uwbslam_jax.multilateration import DECIDED, multilaterate, soften
 
 _MOST_MOVES = 20
 _ENOUGH = 0.02
 """The batch problem is solved when a move gains less log-likelihood than this."""
-
-
-@dataclass
-class Keyframe:
-    """One pose of the start-up track and the ranges taken near it.
-
-    Attributes:
-      frame: its measurements; the scan is drawn again when the frame is decided.
-      pose: (3,) in the start frame [m, m, rad].
-      information: (3, 3) of its match, in the start frame.
-      velocity, yaw_rate: of the robot then, to undo the sweep [m/s, rad/s].
-      seen: slot -> list of (antenna position relative to the pose, range), robot to beacon [m].
-    """
-
-    frame: StampedFrame
-    pose: np.ndarray
-    information: np.ndarray
-    velocity: np.ndarray
-    yaw_rate: float
-    seen: dict[int, list[tuple[np.ndarray, float]]] = field(default_factory=dict)
+CALIBRATED_M = 1e-3
+"""Standard deviation of a node's bias when ranges are taken to be calibrated [m]."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +27,7 @@ class Placement:
     Attributes:
       poses: (N, 3); slots: placed beacons; beacons: (B, 2) [m]; cost: negative log-likelihood.
       cov: joint covariance of poses and beacons in that order (3 N + 2 B).
+      bias, bias_sigma: (1 + B,) of the robot's node and the beacons' [m].
     """
 
     poses: np.ndarray
@@ -52,6 +35,8 @@ class Placement:
     beacons: np.ndarray
     cost: float
     cov: np.ndarray
+    bias: np.ndarray
+    bias_sigma: np.ndarray
 
     def beacon_sigma(self) -> np.ndarray:
         """(B,) largest standard deviation of each beacon's position in the start frame [m]."""
@@ -61,8 +46,16 @@ class Placement:
         """The same with some of the beacons, given by their index."""
         n = self.poses.size
         columns = np.concatenate([np.arange(n), *[n + 2 * b + np.arange(2) for b in kept]]).astype(int)
+        nodes = np.array([0, *[1 + b for b in kept]])
         cov = self.cov[np.ix_(columns, columns)]
-        return Placement(self.poses, [self.slots[b] for b in kept], self.beacons[kept], self.cost, cov)
+        slots = [self.slots[b] for b in kept]
+        return Placement(
+            self.poses, slots, self.beacons[kept], self.cost, cov, self.bias[nodes], self.bias_sigma[nodes]
+        )
+
+    def apart(self, other: Placement) -> np.ndarray:
+        """(B,) how far the beacons of another explanation are from these [m]."""
+        return np.linalg.norm(self.beacons - other.beacons, axis=1)
 
 
 def largest_sigma(cov: np.ndarray) -> np.ndarray:
@@ -75,8 +68,9 @@ def largest_sigma(cov: np.ndarray) -> np.ndarray:
 class Problem:
     """The batch problem in arrays. N keyframes, B beacons, R averaged ranges, E pairs of beacons.
 
-    steps (N-1, 3) relative poses with roots (N-1, 3, 3) of their information; at (R,) keyframe, to (R,) beacon index,
-    local (R, 2), distance (R,), sigma (R,); pair (E, 2) beacon indices, pair_distance (E,), pair_sigma (E,).
+    steps (N-1, 3) relative poses with roots (N-1, 3, 3) of their information; at, after (R,) keyframes before and
+    after a range, share (R,) of the way between them, local_at, local_after (R, 2) the antenna in their frames, to
+    (R,) beacon index, distance, sigma (R,); pair (E, 2) beacon indices, pair_distance, pair_sigma (E,).
     """
 
     slots: list[int]
@@ -84,8 +78,11 @@ class Problem:
     steps: np.ndarray
     roots: np.ndarray
     at: np.ndarray
+    after: np.ndarray
+    share: np.ndarray
+    local_at: np.ndarray
+    local_after: np.ndarray
     to: np.ndarray
-    local: np.ndarray
     distance: np.ndarray
     sigma: np.ndarray
     pair: np.ndarray
@@ -93,105 +90,83 @@ class Problem:
     pair_sigma: np.ndarray
 
     @staticmethod
-    def build(keys: list[Keyframe], pairs: dict[tuple[int, int], list[float]], sigma_n: float) -> Problem:
-        """Arrays of what was buffered; only beacons ranged from at least three keyframes take part."""
-        heard: dict[int, int] = {}
-        for key in keys:
-            for slot in key.seen:
-                heard[slot] = heard.get(slot, 0) + 1
-        slots = sorted(slot for slot, count in heard.items() if count >= 3)
+    def build(buffer: Buffer) -> Problem:
+        """Arrays of what was buffered; only beacons ranged from at least three intervals take part."""
+        keys = buffer.track()
+        seen = buffer.averages(keys)
+        slots = [int(s) for s, count in zip(*np.unique(seen.to, return_counts=True), strict=True) if count >= 3]
         index = {slot: b for b, slot in enumerate(slots)}
-        rows = [
-            (k, index[s], *_average(seen)) for k, key in enumerate(keys) for s, seen in key.seen.items() if s in index
-        ]
-        between = [(index[i], index[j], d) for (i, j), d in pairs.items() if i in index and j in index]
-        track = np.array([key.pose for key in keys])
+        ok = np.isin(seen.to, slots)
+        pairs = [(index[i], index[j], *m) for (i, j), m in buffer.pair_medians().items() if i in index and j in index]
         steps, roots = _steps(keys)
-
-        def sigma(count):
-            return np.sqrt(sigma_n**2 / np.maximum(count, 1) + RANGE_FLOOR_M**2)
-
         return Problem(
             slots=slots,
-            track=track,
+            track=np.array([key.pose for key in keys]),
             steps=steps,
             roots=roots,
-            at=np.array([r[0] for r in rows], int),
-            to=np.array([r[1] for r in rows], int),
-            local=np.array([r[2] for r in rows]).reshape(-1, 2),
-            distance=np.array([r[3] for r in rows]),
-            sigma=sigma(np.array([r[4] for r in rows])),
-            pair=np.array([p[:2] for p in between], int).reshape(-1, 2),
-            pair_distance=np.array([np.median(p[2]) for p in between]),
-            # a median of n is as good as a mean of 0.64 n
-            pair_sigma=sigma(0.64 * np.array([len(p[2]) for p in between])),
+            at=seen.at[ok],
+            after=np.minimum(seen.at[ok] + 1, len(keys) - 1),
+            share=seen.share[ok],
+            local_at=seen.before[ok],
+            local_after=seen.after[ok],
+            to=np.array([index[int(s)] for s in seen.to[ok]], int),
+            distance=seen.distance[ok],
+            sigma=seen.sigma[ok],
+            pair=np.array([p[:2] for p in pairs], int).reshape(-1, 2),
+            pair_distance=np.array([p[2] for p in pairs]),
+            pair_sigma=np.array([p[3] for p in pairs]),
         )
 
-    def starts(self) -> tuple[np.ndarray, np.ndarray]:
-        """Beacon positions (B, 2) to start from: the sides that fit the beacons' own ranges best, and the mirror."""
-        antenna = self._antenna(self.track)
-        near, far = np.zeros((2, len(self.slots), 2))
-        for b in range(len(self.slots)):
-            mine = self.to == b
-            near[b], far[b] = multilaterate(antenna[mine], self.distance[mine], self.sigma[mine])
-        choice = self._consistent_sides(near, far)
-        return np.where(choice[:, None], far, near), np.where(choice[:, None], near, far)
+    def antenna(self, poses: np.ndarray) -> np.ndarray:
+        """(R, 2) where the robot's antenna was when each range was taken, between its two keyframes [m]."""
+        ends = self._antenna_ends(poses)
+        return (1 - self.share)[:, None] * ends[0] + self.share[:, None] * ends[1]
 
-    def _consistent_sides(self, near: np.ndarray, far: np.ndarray) -> np.ndarray:
-        """For each beacon, whether its second candidate is the one that agrees with the ranges between beacons."""
-        count = len(self.slots)
-        if not len(self.pair):
-            return np.zeros(count, bool)
-        rng = np.random.default_rng(0)
-        best, best_cost = np.zeros(count, bool), np.inf
-        for trial in range(8):
-            choice = np.zeros(count, bool) if trial == 0 else rng.random(count) < 0.5
-            cost = self._pair_cost(np.where(choice[:, None], far, near))
-            improved = True
-            while improved:
-                improved = False
-                for b in range(count):
-                    choice[b] ^= True
-                    other = self._pair_cost(np.where(choice[:, None], far, near))
-                    if other < cost - 1e-9:
-                        cost, improved = other, True
-                    else:
-                        choice[b] ^= True
-            if cost < best_cost:
-                best, best_cost = choice.copy(), cost
-        return best
+    def _antenna_ends(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The same as either keyframe alone would have it."""
+        return (
+            poses[self.at, :2] + turned(poses[self.at, 2], self.local_at),
+            poses[self.after, :2] + turned(poses[self.after, 2], self.local_after),
+        )
 
-    def _pair_cost(self, beacons: np.ndarray) -> float:
-        d = np.linalg.norm(beacons[self.pair[:, 0]] - beacons[self.pair[:, 1]], axis=1)
-        return float(np.abs(d - self.pair_distance).sum())
-
-    def _antenna(self, poses: np.ndarray) -> np.ndarray:
-        c, s = np.cos(poses[self.at, 2]), np.sin(poses[self.at, 2])
-        x, y = self.local.T
-        return poses[self.at, :2] + np.stack([c * x - s * y, s * x + c * y], -1)
-
-    def mirror(self, placement: Placement) -> np.ndarray:
-        """The beacons of a placement mirrored at the line that the robot's antenna drove best along."""
-        antenna = self._antenna(placement.poses)
+    def images(self, placement: Placement) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Beacons and poses of a placement mirrored along, across and through the start of the line that the robot's
+        antenna drove best along: a straight drive leaves the first one open, a blind corridor the others as well."""
+        antenna = self.antenna(placement.poses)
         _, _, axes = np.linalg.svd(antenna - antenna.mean(0), full_matrices=False)
-        normal = axes[1]
-        return placement.beacons - 2 * ((placement.beacons - antenna.mean(0)) @ normal)[:, None] * normal
+        found = []
+        for along, across in ((1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)):
+            turn = axes.T @ np.diag([along, across]) @ axes
+            poses = placement.poses.copy()
+            if along < 0:
+                poses[:, :2] = (poses[:, :2] - poses[0, :2]) @ turn + poses[0, :2]
+            centre = antenna.mean(0) if along > 0 else poses[0, :2]
+            found.append(((placement.beacons - centre) @ turn + centre, poses))
+        return found
 
-    def minimise(self, beacons: np.ndarray) -> Placement:
-        """Levenberg-Marquardt from given beacons and the track as it was driven; the first pose is held."""
-        poses, damping = self.track.copy(), 1e-3
-        J, r = self._linearise(poses, beacons)
+    def minimise(
+        self, beacons: np.ndarray, poses: np.ndarray | None = None, bias_sigma: float = CALIBRATED_M
+    ) -> Placement:
+        """Levenberg-Marquardt from given beacons and the track as it was driven; the first pose is held.
+
+        Args:
+          beacons: (B, 2) [m]. poses: (N, 3) to start from instead of the track.
+          bias_sigma: prior spread of each node's range bias [m].
+        """
+        n, m = self.track.size, self.track.size + 2 * len(self.slots)
+        start = self.track if poses is None else poses
+        x = np.concatenate([start.ravel(), beacons.ravel(), np.zeros(1 + len(self.slots))])
+        damping = 1e-3
+        J, r = self._linearise(x, bias_sigma)
         cost = 0.5 * r @ r
         for _ in range(_MOST_MOVES):
             A, g = J.T @ J, J.T @ r
-            move = -np.linalg.solve(A + damping * np.diag(np.diag(A) + 1e-9), g)
-            new_poses = poses + move[: poses.size].reshape(-1, 3)
-            new_beacons = beacons + move[poses.size :].reshape(-1, 2)
-            new_J, new_r = self._linearise(new_poses, new_beacons)
+            moved = x - np.linalg.solve(A + damping * np.diag(np.diag(A) + 1e-9), g)
+            new_J, new_r = self._linearise(moved, bias_sigma)
             new_cost = 0.5 * new_r @ new_r
             if new_cost < cost:
                 done = cost - new_cost < _ENOUGH
-                poses, beacons, J, r, cost = new_poses, new_beacons, new_J, new_r, new_cost
+                x, J, r, cost = moved, new_J, new_r, new_cost
                 damping = max(damping / 5, 1e-9)
                 if done:
                     break
@@ -200,13 +175,25 @@ class Problem:
                 if damping > 1e6:
                     break
         cov = np.linalg.inv(J.T @ J + 1e-9 * np.eye(J.shape[1]))
-        return Placement(poses, self.slots, beacons, float(cost), cov)
+        return Placement(
+            x[:n].reshape(-1, 3),
+            self.slots,
+            x[n:m].reshape(-1, 2),
+            float(cost),
+            cov[:m, :m],
+            x[m:],
+            np.sqrt(np.diag(cov)[m:]),
+        )
 
-    def _linearise(self, poses: np.ndarray, beacons: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Whitened Jacobian (rows, 3 N + 2 B) and residuals of held start, steps, ranges and pairs."""
-        n, b = poses.size, beacons.size
-        blocks = [self._hold_start(poses, n + b), self._step_rows(poses, n + b)]
-        blocks += [self._range_rows(poses, beacons, n + b), self._pair_rows(poses, beacons, n + b)]
+    def _linearise(self, x: np.ndarray, bias_sigma: float) -> tuple[np.ndarray, np.ndarray]:
+        """Whitened Jacobian (rows, 3 N + 2 B + 1 + B) and residuals of held start, steps, ranges, pairs and biases."""
+        n, m = self.track.size, self.track.size + 2 * len(self.slots)
+        poses, beacons, bias = x[:n].reshape(-1, 3), x[n:m].reshape(-1, 2), x[m:]
+        blocks = [self._hold_start(poses, len(x)), self._step_rows(poses, len(x))]
+        blocks += [self._range_rows(poses, beacons, bias), self._pair_rows(beacons, bias, len(x))]
+        prior = np.zeros((len(bias), len(x)))
+        prior[:, m:] = np.eye(len(bias)) / bias_sigma
+        blocks.append((prior, bias / bias_sigma))
         return np.concatenate([J for J, _ in blocks]), np.concatenate([r for _, r in blocks])
 
     def _hold_start(self, poses, columns):
@@ -232,77 +219,81 @@ class Problem:
             J[rows, :, 3 * rows + k] = np.einsum("mij,mj->mi", self.roots, local[:, :, k])
         return J.reshape(-1, columns), np.einsum("mij,mj->mi", self.roots, e).ravel()
 
-    def _range_rows(self, poses, beacons, columns):
-        antenna = self._antenna(poses)
+    def _range_rows(self, poses, beacons, bias):
+        ends = self._antenna_ends(poses)
+        antenna = (1 - self.share)[:, None] * ends[0] + self.share[:, None] * ends[1]
         u = antenna - beacons[self.to]
         d = np.maximum(np.linalg.norm(u, axis=1), 1e-6)
         unit = u / d[:, None]
-        lever = antenna - poses[self.at, :2]
-        r, scale = soften((d - self.distance) / self.sigma)
+        r, scale = soften((d + bias[0] + bias[1 + self.to] - self.distance) / self.sigma)
         weight = scale / self.sigma
-        rows, J = np.arange(len(d)), np.zeros((len(d), columns))
+        n, m = poses.size, poses.size + beacons.size
+        rows, J = np.arange(len(d)), np.zeros((len(d), m + len(bias)))
+        for key, end, part in ((self.at, ends[0], 1 - self.share), (self.after, ends[1], self.share)):
+            lever = end - poses[key, :2]
+            for axis in range(2):
+                J[rows, 3 * key + axis] += part * weight * unit[:, axis]
+            J[rows, 3 * key + 2] += part * weight * (unit[:, 1] * lever[:, 0] - unit[:, 0] * lever[:, 1])
         for axis in range(2):
-            J[rows, 3 * self.at + axis] = weight * unit[:, axis]
-            J[rows, poses.size + 2 * self.to + axis] = -weight * unit[:, axis]
-        J[rows, 3 * self.at + 2] = weight * (unit[:, 1] * lever[:, 0] - unit[:, 0] * lever[:, 1])
+            J[rows, n + 2 * self.to + axis] = -weight * unit[:, axis]
+        J[rows, m], J[rows, m + 1 + self.to] = weight, weight
         return J, r
 
-    def _pair_rows(self, poses, beacons, columns):
+    def _pair_rows(self, beacons, bias, columns):
         i, j = self.pair.T
         u = beacons[i] - beacons[j]
         d = np.maximum(np.linalg.norm(u, axis=1), 1e-6)
-        r, scale = soften((d - self.pair_distance) / self.pair_sigma)
-        weight = (scale / self.pair_sigma / d)[:, None] * u
+        r, scale = soften((d + bias[1 + i] + bias[1 + j] - self.pair_distance) / self.pair_sigma)
+        weight = scale / self.pair_sigma
+        n, m = self.track.size, self.track.size + beacons.size
         rows, J = np.arange(len(d)), np.zeros((len(d), columns))
         for axis in range(2):
-            J[rows, poses.size + 2 * i + axis] = weight[:, axis]
-            J[rows, poses.size + 2 * j + axis] = -weight[:, axis]
+            J[rows, n + 2 * i + axis] = weight * u[:, axis] / d
+            J[rows, n + 2 * j + axis] = -weight * u[:, axis] / d
+        J[rows, m + 1 + i], J[rows, m + 1 + j] = weight, weight
         return J, r
 
-    def keep_unique(self, best: Placement) -> Placement:
+    def keep_unique(self, best: Placement, bias_sigma: float = CALIBRATED_M) -> Placement:
         """The placement without the beacons that have a second place which explains the ranges as well."""
-        antenna, sigma = self._antenna(best.poses), best.beacon_sigma()
+        antenna, sigma = self.antenna(best.poses), best.beacon_sigma()
         unique = []
         for b in range(len(self.slots)):
             mine = self.to == b
-            spots = np.stack(multilaterate(antenna[mine], self.distance[mine], self.sigma[mine]))
+            distance = self.distance[mine] - best.bias[0] - best.bias[1 + b]
+            spots = np.stack(multilaterate(antenna[mine], distance, self.sigma[mine]))
             away = spots[np.argmax(np.linalg.norm(spots - best.beacons[b], axis=1))]
             moved = best.beacons.copy()
             moved[b] = away
-            _, r = self._linearise(best.poses, moved)
+            _, r = self._linearise(np.concatenate([best.poses.ravel(), moved.ravel(), best.bias]), bias_sigma)
             near = np.linalg.norm(away - best.beacons[b]) < max(4 * sigma[b], 0.3)
             unique.append(near or 0.5 * r @ r - best.cost > DECIDED)
         return best.only([b for b, ok in enumerate(unique) if ok])
-
-
-def _average(seen: list[tuple[np.ndarray, float]]) -> tuple[np.ndarray, float, int]:
-    """Mean place, distance and count of the ranges near one keyframe, without the ones far from their median."""
-    local = np.array([s[0] for s in seen])
-    distance = np.array([s[1] for s in seen])
-    middle = np.sort(distance)[len(distance) // 2]  # one of them, so that at least one is near it
-    ok = np.abs(distance - middle) < 0.5
-    return local[ok].mean(0), float(distance[ok].mean()), int(ok.sum())
 
 
 def _steps(keys: list[Keyframe]) -> tuple[np.ndarray, np.ndarray]:
     """Relative poses of consecutive keyframes and the roots of their information, in the earlier one's frame."""
     steps, roots = np.zeros((len(keys) - 1, 3)), np.zeros((len(keys) - 1, 3, 3))
     for k, (a, b) in enumerate(pairwise(keys)):
-        R = rotation(a.pose[2]).T
-        u = b.pose - a.pose
-        steps[k] = np.append(R @ u[:2], u[2])
+        u = turned(-a.pose[2], b.pose[:2] - a.pose[:2])
+        steps[k] = np.append(u, b.pose[2] - a.pose[2])
         turn = np.eye(3)
-        turn[:2, :2] = R
-        length = np.hypot(*u[:2])
-        # where the match says nothing, the motion model still bounds the step; where it says much, the map it was
-        # matched with has its own drift
-        loose = np.diag([0.1 + 0.2 * length, 0.1 + 0.2 * length, 0.05 + 0.1 * abs(u[2])]) ** 2
-        tight = np.diag([0.005 + 0.01 * length, 0.005 + 0.01 * length, 0.002 + 0.003 * abs(u[2])]) ** 2
+        turn[:2, :2] = rotation(a.pose[2]).T
+        length, angle = np.hypot(*u), abs(steps[k, 2])
+        elapsed = (b.frame.stamp - a.frame.stamp) / 1e9
+        # where the match says nothing, wheels or the motion model still bound the step; where it says much, the map
+        # it was matched with has its own drift
+        if b.odometry:
+            loose = np.diag([0.03 + 0.06 * length, 0.03 + 0.06 * length, 0.02 + 0.06 * angle]) ** 2
+        else:
+            pace = 0.1 + 0.2 * length + min(elapsed, 3.0)
+            loose = np.diag([pace, pace, 0.05 + 0.1 * angle]) ** 2
+        tight = np.diag([0.005 + 0.01 * length, 0.005 + 0.01 * length, 0.002 + 0.003 * angle]) ** 2
         cov = np.linalg.inv(turn @ b.information @ turn.T + np.linalg.inv(loose)) + tight
         roots[k] = np.linalg.cholesky(np.linalg.inv(cov)).T
     return steps, roots
 
 
 def rotation(theta: float) -> np.ndarray:
+    """(2, 2) rotation by an angle [rad]."""
     c, s = np.cos(theta), np.sin(theta)
     return np.array([[c, -s], [s, c]])

@@ -13,16 +13,17 @@ from collections.abc import Sequence
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
 from uwbslam_jax import slam, startup
 from uwbslam_jax.beacons import BeaconKeeper
-from uwbslam_jax.config import Settings, make_config, make_params
+from uwbslam_jax.config import Params, Settings, make_config, make_params
 from uwbslam_jax.history import History
+from uwbslam_jax.keyframes import Buffer
 from uwbslam_jax.measurements import Frame, StampedFrame
 from uwbslam_jax.slam import Estimate, State
-from uwbslam_jax.startup import Buffer
 from uwbslam_jax.tiles import Tiles
 
 CONTROL_EVERY = 10
@@ -62,6 +63,7 @@ class Session:
       state: the estimator's.
       decided_at: stamp of the frame at which the published frame was decided, None before [ns].
       status: of the start-up, in words.
+      found_bias: slot -> range bias that start-up found beyond the configured one [m]; empty where there is none.
       history: what was reported so far.
     """
 
@@ -76,6 +78,7 @@ class Session:
         self.decided_at: int | None = None
         self.status = "LiDAR only" if settings.filter.lidar_only else "waiting for motion"
         self.hypotheses = 0
+        self.found_bias: dict[int, float] = {}
         self._slots: dict[int, int] = {settings.robot.id: 0}
         self._pending: list[tuple[StampedFrame, Estimate]] = []
         self._solved_at = self._solved_with = 0
@@ -120,12 +123,20 @@ class Session:
     def _learn_slots(self, frame: StampedFrame) -> None:
         if len(frame.slots) > len(self._slots):
             self._slots = dict(frame.slots)
-            self.params = make_params(self.settings, self._slots)
+            self.params = self._biased(make_params(self.settings, self._slots))
             self._buffer.height, self._buffer.bias = np.asarray(self.params.height), np.asarray(self.params.bias)
+
+    def _biased(self, params: Params) -> Params:
+        """Parameters with the biases that start-up found added to the configured ones."""
+        bias = np.array(params.bias)
+        for slot, found in self.found_bias.items():
+            bias[slot] += found
+        return params._replace(bias=jnp.asarray(bias, jnp.float32))
 
     def _new_buffer(self) -> Buffer:
         p = self.params
-        return Buffer(np.asarray(p.antenna, float), np.asarray(p.height), np.asarray(p.bias), float(p.sigma_n))
+        antenna, height, bias = np.asarray(p.antenna, float), np.asarray(p.height), np.asarray(p.bias)
+        return Buffer(antenna, height, bias, float(p.sigma_n), float(p.bias_scale))
 
     def _take(self, frame: StampedFrame, estimate: Estimate) -> None:
         self.history.add(frame, estimate, self.hypotheses)
@@ -160,6 +171,10 @@ class Session:
         if outcome.placement is None:
             return
         origin, along = startup.choose_frame(outcome.placement, ids)
+        if outcome.biased:
+            nodes = [0, *outcome.placement.slots]
+            self.found_bias = dict(zip(nodes, map(float, outcome.placement.bias), strict=True))
+            self.params = self._biased(self.params)
         adopted = startup.adopt(self.config, self.params, self.state, self._buffer, outcome.placement, (origin, along))
         self.state, self.decided_at = adopted.state, now
         self.config = make_config(self.settings)

@@ -1,7 +1,7 @@
 """Start-up without prior knowledge (DESIGN 1.7): where the beacons stand in the frame the robot started in.
 
 While the step runs on LiDAR (and odometry) alone, a `Buffer` keeps keyframes and what was ranged around them.
-`solve` places the beacons for both reflections and says how much better one explains the ranges than the other.
+`solve` places the beacons in every way that may explain the ranges and says how much better the best one does.
 `adopt` puts a decided placement into the state: the paper's frame, the joint covariance, the map drawn again.
 """
 
@@ -18,86 +18,24 @@ from uwbslam_jax import grid as occupancy
 from uwbslam_jax import layout, slam
 from uwbslam_jax.config import Config, Params
 from uwbslam_jax.ekf import Gaussian
-from uwbslam_jax.measurements import Ranges, Scan, StampedFrame
+from uwbslam_jax.hypotheses import explanations
+from uwbslam_jax.keyframes import Buffer, Keyframe
+from uwbslam_jax.measurements import Ranges, Scan
 from uwbslam_jax.multilateration import DECIDED, SIGMA_ENOUGH_M
-from uwbslam_jax.placement import Keyframe, Placement, Problem, largest_sigma, rotation
-from uwbslam_jax.slam import Estimate, State
+from uwbslam_jax.placement import CALIBRATED_M, Placement, Problem, largest_sigma, rotation
+from uwbslam_jax.slam import State
 from uwbslam_jax.tiles import TILE
 
-_KEYFRAME_MOVED = (0.25, 0.2)
-"""A keyframe every so much of path or turn [m, rad]."""
-_KEYFRAMES = 64
-"""A longer start is thinned: every other keyframe goes."""
 _MOVED_ENOUGH_M = 1.0
+_BIAS_M = 0.3
+"""Prior spread of a node's range bias once ranges do not look calibrated [m]."""
 _HEADING_ENOUGH = 0.026
 """Start-up ends when the robot's heading among the beacons is known this well [rad]."""
-
-
-class Buffer:
-    """Keyframes and averaged ranges of the start, bounded in size."""
-
-    def __init__(self, antenna: np.ndarray, height: np.ndarray, bias: np.ndarray, sigma_n: float):
-        self.keyframes: list[Keyframe] = []
-        self.pairs: dict[tuple[int, int], list[float]] = {}
-        self.antenna, self.height, self.bias, self.sigma_n = antenna, height, bias, sigma_n
-
-    @property
-    def extent(self) -> float:
-        """Largest distance from the first keyframe [m]."""
-        if not self.keyframes:
-            return 0.0
-        return max(float(np.linalg.norm(k.pose[:2] - self.keyframes[0].pose[:2])) for k in self.keyframes)
-
-    @property
-    def newest(self) -> int:
-        """Stamp of the newest keyframe [ns], 0 without any."""
-        return self.keyframes[-1].frame.stamp if self.keyframes else 0
-
-    def add(self, frame: StampedFrame, estimate: Estimate, usable: np.ndarray) -> None:
-        """Take in one frame with the pose that LiDAR (and odometry) gave it, and which of its ranges may be used."""
-        pose = np.asarray(estimate.pose, float)
-        velocity, yaw_rate = np.asarray(estimate.velocity, float), float(estimate.yaw_rate)
-        last = self.keyframes[-1].pose if self.keyframes else None
-        if last is None or (
-            bool(frame.frame.has_scan)
-            and not estimate.poor
-            and (np.hypot(*(pose - last)[:2]) > _KEYFRAME_MOVED[0] or abs(pose[2] - last[2]) > _KEYFRAME_MOVED[1])
-        ):
-            self.keyframes.append(Keyframe(frame, pose, np.asarray(estimate.information, float), velocity, yaw_rate))
-            if len(self.keyframes) > _KEYFRAMES:
-                self._thin()
-        for k in np.flatnonzero(usable):
-            self._add_range(frame.frame.ranges, int(k), pose, velocity, yaw_rate)
-
-    def _add_range(self, r: Ranges, k: int, pose: np.ndarray, velocity: np.ndarray, yaw_rate: float) -> None:
-        i, j = sorted((int(r.i[k]), int(r.j[k])))
-        rise = self.height[i] - self.height[j]
-        slant = float(r.range[k]) - self.bias[i] - self.bias[j]
-        flat = float(np.sqrt(max(slant**2 - rise**2, 0.01)))
-        if i > 0:
-            kept = self.pairs.setdefault((i, j), [])
-            kept.append(flat)
-            del kept[:-400]
-            return
-        age = float(r.age[k])
-        heading = pose[2] + yaw_rate * age
-        antenna = pose[:2] + age * velocity + rotation(heading) @ self.antenna
-        key = self.keyframes[-1]
-        local = rotation(key.pose[2]).T @ (antenna - key.pose[:2])
-        key.seen.setdefault(j, []).append((local, flat))
-
-    def _thin(self) -> None:
-        kept = [self.keyframes[0]]
-        for k, key in enumerate(self.keyframes[1:], start=1):
-            if k % 2 == 0 or key is self.keyframes[-1]:
-                kept.append(key)
-                continue
-            into = kept[-1]
-            move = rotation(into.pose[2]).T @ (key.pose[:2] - into.pose[:2])
-            turn = rotation(key.pose[2] - into.pose[2])
-            for slot, seen in key.seen.items():
-                into.seen.setdefault(slot, []).extend((move + turn @ local, d) for local, d in seen)
-        self.keyframes = kept
+_UNDRAWN_HEADING = 0.15
+_UNDRAWN_SIGMA = 0.05
+"""The same without a map [rad], and for positions as a share of the distance between beacons."""
+_UNDRAWN_WAIT_S = 60.0
+"""Without a map so long is waited for beacons that are not yet certain: placed together they are placed best."""
 
 
 def usable(ranges: Ranges, nlos_gap_db: float) -> np.ndarray:
@@ -114,52 +52,68 @@ class Outcome:
       hypotheses: how many explanations are alive (0 before there is one).
       margin: difference of log-likelihood between the two reflections.
       placement: the decided one, else None.
+      biased: whether the ranges are explained far better with a bias of each node; a placement
+        then has them.
     """
 
     status: str
     hypotheses: int
     margin: float
     placement: Placement | None
+    biased: bool = False
 
 
 def solve(buffer: Buffer, ids: dict[int, int]) -> Outcome:
     """Place the beacons if what is buffered determines them. ids: slot -> node id."""
-    if buffer.extent < _MOVED_ENOUGH_M:
+    if buffer.extent < _MOVED_ENOUGH_M and not any(key.blind for key in buffer.keyframes[1:]):
         return Outcome("waiting for motion", 0, 0.0, None)
-    problem = Problem.build(buffer.keyframes, buffer.pairs, buffer.sigma_n)
+    problem = Problem.build(buffer)
     if len(problem.slots) < 2:
         return Outcome("placing beacons", 0, 0.0, None)
-    first, second = problem.starts()
-    found = sorted((problem.minimise(first), problem.minimise(second)), key=lambda p: p.cost)
-    best, margin = found[0], _margin(*found)
-    # the second start may have slid into the first one's valley: ask the exact mirror image as well
-    mirrored = problem.minimise(problem.mirror(best))
-    if mirrored.cost < best.cost:
-        best, mirrored = mirrored, best
-    margin = min(margin, _margin(best, mirrored))
+    found, bias_sigma = _explain(problem)
+    best, biased = found[0], bias_sigma > CALIBRATED_M
+    margin = found[1].cost - best.cost if len(found) > 1 else float("inf")
     if margin < DECIDED:
-        return Outcome("reflection undecided", 2, margin, None)
-    sure = _keep_certain(problem.keep_unique(best), ids)
-    if sure is None:
-        return Outcome("placing beacons", 1, margin, None)
-    return Outcome("decided", 1, margin, sure)
+        alive = sum(other.cost - best.cost < DECIDED for other in found)
+        return Outcome("reflection undecided", alive, margin, None, biased)
+    drawn = any(key.information.any() for key in buffer.keyframes)
+    sure = _keep_certain(problem.keep_unique(best, bias_sigma), ids, drawn=drawn)
+    waits = not drawn and buffer.newest - buffer.keyframes[0].frame.stamp < _UNDRAWN_WAIT_S * 1e9
+    if sure is None or (waits and len(sure.slots) < len(problem.slots)):
+        return Outcome("placing beacons", 1, margin, None, biased)
+    return Outcome("decided", 1, margin, sure, biased)
 
 
-def _keep_certain(placement: Placement, ids: dict[int, int]) -> Placement | None:
+def _explain(problem: Problem) -> tuple[list[Placement], float]:
+    """Explanations, the best first, with ranges taken as calibrated, or with a bias of each node where that explains
+    them far better; and the spread of the biases that was allowed [m]."""
+    found = explanations(problem, CALIBRATED_M)
+    freed = problem.minimise(found[0].beacons, found[0].poses, _BIAS_M)
+    if found[0].cost - freed.cost < DECIDED + 3.0 * len(freed.bias):
+        return found, CALIBRATED_M
+    return explanations(problem, _BIAS_M), _BIAS_M
+
+
+def _keep_certain(placement: Placement, ids: dict[int, int], *, drawn: bool) -> Placement | None:
     """The beacons whose place in the published frame is certain, None where the robot's own is not.
 
-    The start frame is no measure: all beacons turn together with the heading that the track started with.
+    The start frame is no measure: all beacons turn together with the heading that the track started with. Where no map
+    is drawn, nothing is lost by a frame that is known less well: the filter only has to be near enough to be linear.
     """
     if len(placement.slots) < 2:
         return None
     frame_slots = choose_frame(placement, ids)
+    sigma_enough, heading_enough = SIGMA_ENOUGH_M, _HEADING_ENOUGH
+    if not drawn:
+        span = float(np.max(np.linalg.norm(placement.beacons - placement.beacons[0], axis=1)))
+        sigma_enough, heading_enough = max(sigma_enough, _UNDRAWN_SIGMA * span), _UNDRAWN_HEADING
     onward = np.zeros(3)
     x, cov = _last_and_beacons(placement)
     J = _numeric_jacobian(partial(_published, slots=placement.slots, frame_slots=frame_slots, onward=onward), x)
     cov = J @ cov @ J.T
-    if np.sqrt(cov[2, 2]) > _HEADING_ENOUGH or largest_sigma(cov[:2, :2])[0] > SIGMA_ENOUGH_M:
+    if np.sqrt(cov[2, 2]) > heading_enough or largest_sigma(cov[:2, :2])[0] > sigma_enough:
         return None
-    certain = largest_sigma(cov[3:, 3:]) < SIGMA_ENOUGH_M
+    certain = largest_sigma(cov[3:, 3:]) < sigma_enough
     return placement.only([b for b, ok in enumerate(certain) if ok]) if sum(certain) >= 2 else None
 
 
@@ -177,12 +131,6 @@ def _last_and_beacons(placement: Placement) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([placement.poses[-1], placement.beacons.ravel()]), placement.cov[last:, last:]
 
 
-def _margin(best: Placement, other: Placement) -> float:
-    """How much better the one explains the ranges than the other; infinite where they are the same place."""
-    same = np.linalg.norm(best.beacons - other.beacons, axis=1).max() < 0.3
-    return float("inf") if same else other.cost - best.cost
-
-
 @dataclass(frozen=True)
 class Adopted:
     """A start-up that was decided.
@@ -190,7 +138,7 @@ class Adopted:
     Attributes:
       state: the estimator's state in the published frame.
       anchors: (N,) stamps of the keyframes [ns]; before, after: (N, 3) their poses in the start frame and in the
-        published one. A pose of the start moves with the last keyframe before it.
+        published one. A pose of the start moves with the keyframes before and after it.
     """
 
     state: State
@@ -199,9 +147,14 @@ class Adopted:
     after: np.ndarray
 
     def republish(self, stamps: np.ndarray, poses: np.ndarray) -> np.ndarray:
-        """Poses (T, 3) of the start frame, taken at stamps (T,), in the published frame."""
-        at = np.clip(np.searchsorted(self.anchors, stamps, side="right") - 1, 0, len(self.anchors) - 1)
-        return compose(self.after[at], between(self.before[at], poses))
+        """Poses (T, 3) of the start frame, taken at stamps (T,) [ns], in the published frame."""
+        last = len(self.anchors) - 1
+        at = np.clip(np.searchsorted(self.anchors, stamps, side="right") - 1, 0, last)
+        after = np.minimum(at + 1, last)
+        span = np.maximum(self.anchors[after] - self.anchors[at], 1)
+        share = np.clip((stamps - self.anchors[at]) / span, 0.0, 1.0)[:, None]
+        ends = [compose(self.after[k], between(self.before[k], poses)) for k in (at, after)]
+        return (1 - share) * ends[0] + share * ends[1]
 
 
 def adopt(
@@ -218,7 +171,8 @@ def adopt(
       state: of the LiDAR-only run in the start frame.
       frame_slots: slots of the two beacons that make the frame.
     """
-    before = np.array([key.pose for key in buffer.keyframes])
+    keys = buffer.track()
+    before = np.array([key.pose for key in keys])
     pose = np.asarray(layout.robot_pose(state.belief.mean), float)
     onward = between(before[-1], pose)
     x, cov = _last_and_beacons(placement)
@@ -229,15 +183,16 @@ def adopt(
     after = compose(motion, placement.poses)
     belief = _belief(state.belief, config.nodes, y(x), cov, placement.slots, pose)
     active = jnp.zeros(config.nodes, bool).at[jnp.array([0, *placement.slots])].set(True)
-    grid = _redraw(config, params, buffer.keyframes, after, y(x)[:2])
+    grid = _redraw(config, params, keys, after, y(x)[:2])
     adopted = state._replace(
         belief=belief,
         active=active,
         frame_slots=jnp.array(frame_slots, jnp.int32),
+        scatter=state.scatter._replace(log=jnp.asarray(buffer.scatter(config.nodes), jnp.float32)),
         grid=grid,
         drawn_pose=jnp.asarray(y(x)[:3], jnp.float32),
     )
-    return Adopted(adopted, np.array([key.frame.stamp for key in buffer.keyframes]), before, after)
+    return Adopted(adopted, np.array([key.frame.stamp for key in keys]), before, after)
 
 
 def _frame_motion(beacons: np.ndarray, slots: list[int], frame_slots: tuple[int, int]) -> np.ndarray:
