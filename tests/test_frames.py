@@ -238,6 +238,46 @@ def test_ranges_without_scans_make_frames_of_about_a_second():
         assert f.frame.ranges.age[f.frame.ranges.valid].min() >= -1.0 - 1e-6
 
 
+def driven(seconds: np.ndarray) -> list[OdometryMessage]:
+    return [odometry(t, 0.5 * t, 0.0, 0.3 * t) for t in seconds]
+
+
+def test_without_scans_the_odometry_makes_the_frames():
+    """A frame at its stamps, not at every one where they come fast, each with the ranges up to it and its turn."""
+    make = assembler()
+    wheels, ranges = driven(np.arange(0, 6, 0.05)), [ranged(t) for t in np.arange(0.02, 6, 0.2)]
+    frames = list(make.frames(sorted([*wheels, *ranges], key=lambda m: m.stamp)))
+    assert [f.stamp for f in frames] == [at(t) for t in np.arange(0, 6, 0.1)]
+    assert not any(f.frame.has_scan for f in frames)
+    assert all(f.frame.odometry.valid for f in frames[1:])
+    np.testing.assert_allclose([f.frame.odometry.increment[2] for f in frames[1:]], 0.03, atol=1e-6)
+    assert len(taken(frames)) == len(ranges)
+    assert min(float(f.frame.ranges.age.min()) for f in frames) > -0.1 - 1e-6
+    assert make.flush() == []
+    assert make.odometry_used
+
+
+def test_a_range_of_the_same_stamp_as_the_odometry_belongs_to_its_frame():
+    make = assembler()
+    wheels = driven(np.arange(0, 6, 0.1))
+    frames = list(make.frames([m for wheel in wheels for m in (wheel, RangeMessage(wheel.stamp, 0, 1, 5.0))]))
+    assert len(frames) == len(wheels)
+    assert all(float(f.frame.ranges.age[0]) == 0.0 for f in frames)
+
+
+def test_odometry_takes_over_when_scans_stop_and_hands_back_when_they_return():
+    make = assembler()
+    scans = [scan(t) for t in [*np.arange(0, 2, 0.1), *np.arange(8, 10, 0.1)]]
+    frames = list(make.frames(sorted([*driven(np.arange(-0.1, 10, 0.1) + 0.001), *scans], key=lambda m: m.stamp)))
+    with_scan = [f.stamp for f in frames if f.frame.has_scan]
+    between = [f.stamp for f in frames if not f.frame.has_scan]
+    assert len(with_scan) == 40
+    assert len(between) == 59  # the last odometry before the scans is not waited for
+    assert at(1.9) < min(between)
+    assert max(between) < at(8.0)
+    assert sum(float(f.frame.odometry.increment[2]) for f in frames) == pytest.approx(0.3 * 9.9, abs=1e-4)
+
+
 def test_a_gap_between_scans_does_not_lose_its_ranges():
     make = assembler(max_ranges=32)
     stream = [scan(0.0), *[ranged(0.1 + 0.1 * k, 0, 1, 1.0 + k) for k in range(45)], scan(4.7), ranged(4.8), scan(4.9)]

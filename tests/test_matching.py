@@ -20,20 +20,24 @@ CELLS, LEVELS, RESOLUTION, BEAMS = 128, 3, 0.1, 180
 SIGMA_L = 0.25
 
 
+def blind_direction(sweep):
+    return matching.blind_direction(matching.surface(sweep), sweep.valid)
+
+
 @partial(jax.jit, static_argnums=5)
 def align(grid, sweep, start, prior, sigma_l, resolution):
-    return matching.align(grid, sweep, matching.blind_direction(sweep), start, prior, sigma_l, resolution)
+    return matching.align(grid, sweep, blind_direction(sweep), start, prior, sigma_l, resolution)
 
 
 @partial(jax.jit, static_argnums=3)
 def assess(grid, sweep, pose, resolution):
-    return matching.assess(grid, sweep, matching.blind_direction(sweep), pose, resolution)
+    return matching.assess(grid, sweep, matching.surface(sweep), pose, resolution)
 
 
 @partial(jax.jit, static_argnums=4)
 def search(grid, sweep, prior, sigma_l, resolution):
-    blind = matching.blind_direction(sweep)
-    return matching.search(grid, sweep, blind, prior, prior.mean, sigma_l, resolution)
+    known = (prior.mean, prior.mean)
+    return matching.search(grid, sweep, matching.surface(sweep), prior, known, sigma_l, resolution)
 
 
 def sweep_at(pose, beams=BEAMS, walls=room.WALLS):
@@ -100,11 +104,24 @@ def test_a_map_that_pretends_to_know_the_way_along_a_corridor_is_not_believed():
 @pytest.mark.parametrize("heading", [0.0, 0.7, 2.0])
 def test_a_corridor_is_blind_along_its_walls_and_a_room_is_not(heading):
     corridor = np.array([[[-30.0, -1.05], [30.0, -1.05]], [[30.0, 1.05], [-30.0, 1.05]]])
-    blind = matching.blind_direction(sweep_at((0.0, 0.2, heading), walls=corridor))
+    blind = blind_direction(sweep_at((0.0, 0.2, heading), walls=corridor))
     assert float(blind.weight) == 1.0
     along = np.array([np.cos(heading), -np.sin(heading)])  # the x axis in the robot's frame
     np.testing.assert_allclose(abs(float(blind.direction @ along)), 1.0, atol=1e-3)  # 2.5 degrees
-    assert float(matching.blind_direction(sweep_at((0.3, 0.2, heading))).weight) == 0.0
+    assert float(blind_direction(sweep_at((0.3, 0.2, heading))).weight) == 0.0
+
+
+def test_the_end_of_a_corridor_tells_nothing_before_it_is_drawn():
+    side = [[[-30.0, -1.05], [4.0, -1.05]], [[4.0, 1.05], [-30.0, 1.05]]]
+    corridor, closed = np.array(side), np.array([*side, [[4.0, -1.05], [4.0, 1.05]]])
+    sweep = sweep_at((0.0, 0.05, 0.0), walls=closed)
+    before, after = (drawn(walls, [(x, 0.0, 0.0) for x in np.arange(-2.0, 0.1, 0.25)]) for walls in (corridor, closed))
+    pose = jnp.array([0.0, 0.05, 0.0])
+    unseen, known = assess(before, sweep, pose, RESOLUTION), assess(after, sweep, pose, RESOLUTION)
+    # the beams that end in the corners are taken for known
+    assert float(unseen.information[0, 0]) < 0.1 * float(known.information[0, 0])
+    np.testing.assert_allclose(unseen.informed, np.diag([0.0, 1.0]), atol=0.1)
+    np.testing.assert_allclose(known.informed, np.eye(2), atol=1e-6)
 
 
 def test_a_scan_without_beams_stays_at_the_prior(room_map):

@@ -299,8 +299,8 @@ class TestBrokenFiles:
             if ends is not None:
                 assert len(found) >= sum(count for end, count in ends if end <= size)
         assert last == len(messages)
-        why = "no scan topic (/scan or any LaserScan); there are no topics; recording breaks after N.N s (byte N of N)"
-        assert said <= {why}
+        why = "no scan topic (/scan or any LaserScan), no odometry and no ranges; there are no topics"
+        assert said <= {f"{why}; recording breaks after N.N s (byte N of N)"}
 
     def test_a_cut_tells_when(self, tmp_path: Path) -> None:
         path = write_log(tmp_path / "a.mcap", log_messages())
@@ -401,10 +401,16 @@ def chunk_ends(path: Path) -> list[tuple[int, int]]:
 
 class TestTopics:
     def test_no_scan_topic(self, tmp_path: Path) -> None:
-        path = write_log(tmp_path / "a.mcap", [RangeMessage(T0, 0, 1, 1.0)])
-        with pytest.raises(LogError, match=r"no scan topic .*/uwb/ranges \(uwbslam_msgs/msg/UwbRange\)"):
+        path = write_log(tmp_path / "a.mcap", [TruthMessage(T0, None, 0.0, 0.0, 0.0)])
+        with pytest.raises(LogError, match=r"no scan topic .*/ground_truth/robot \(geometry_msgs/msg/PoseStamped\)"):
             LogReader(path)
         assert len(list(LogReader(path, scan_topic=None))) == 1
+
+    def test_ranges_or_odometry_alone_are_read(self, tmp_path: Path) -> None:
+        path = write_log(tmp_path / "a.mcap", [RangeMessage(T0, 0, 1, 1.0)])
+        assert LogReader(path).warnings == []
+        path = write_log(tmp_path / "b.mcap", [OdometryMessage(T0, 0.0, 0.0, 0.0)])
+        assert LogReader(path).warnings == ["no UWB topic: odometry only"]
 
     def test_no_uwb_topic(self, tmp_path: Path) -> None:
         reader = LogReader(write_log(tmp_path / "a.mcap", [scan(T0)]))

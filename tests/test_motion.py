@@ -22,6 +22,7 @@ SIZE = layout.state_size(NODES)
 NONE = Odometry(jnp.zeros(3), jnp.array(False))
 RESTING = jnp.zeros(NODES, bool)
 CARRIED = jnp.array([False, True, False])
+UNREST = jnp.array([0.02, 0.01]) ** 2
 
 predict, transition = jax.jit(motion.predict), jax.jit(motion.transition)
 
@@ -83,12 +84,23 @@ def test_a_robot_that_is_not_seen_comes_to_rest_within_its_coasting_distance():
 
 
 def test_odometry_moves_the_robot_by_its_increment_in_the_robots_own_frame():
-    s = driven(0.1, odometry(0.1, 0.02, 0.05), heading=np.pi / 2, velocity=(9.0, 9.0), yaw_rate=9.0)
+    s = driven(0.1, odometry(0.1, 0.02, 0.05), heading=np.pi / 2, velocity=(0.2, 0.8), yaw_rate=0.3)
     # at a heading of 90 degrees, forward is +y and left is -x
     np.testing.assert_allclose(s.positions[0], [1.0 - 0.02, 2.0 + 0.1], atol=1e-6)
     np.testing.assert_allclose(s.heading, np.pi / 2 + 0.05, rtol=1e-6)
     np.testing.assert_allclose(s.velocities[0], [-0.2, 1.0], atol=1e-5)
     np.testing.assert_allclose(s.yaw_rate, 0.5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("dt", [0.0, 0.0025])
+def test_an_increment_whose_stamps_came_late_moves_the_robot_but_makes_it_no_racer(dt):
+    """0.17 m and 15 degrees in 2.5 ms: a logger that wrote two scans at once."""
+    s = driven(dt, odometry(0.17, 0.0, 0.26), velocity=(0.3, 0.0), yaw_rate=0.1)
+    np.testing.assert_allclose(s.positions[0], [1.17, 2.0], atol=1e-6)
+    np.testing.assert_allclose(s.heading, 0.26, rtol=1e-6)
+    # at most 5 m/s^2 and 15 rad/s^2
+    np.testing.assert_allclose(s.velocities[0], [0.3 + 5.0 * dt, 0.0], atol=1e-6)
+    np.testing.assert_allclose(s.yaw_rate, 0.1 + 15.0 * dt, atol=1e-6)
 
 
 def test_only_carried_beacons_move():
@@ -108,7 +120,7 @@ def test_map_error_is_a_rigid_motion_that_a_later_pose_sees_through_its_lever_ar
 
 def test_time_zero_is_no_motion_and_finite(params):
     belief = Gaussian(state(velocity=(1.0, 0.0), yaw_rate=1.0), jnp.eye(SIZE))
-    after = predict(belief, params, jnp.array(0.0), NONE, RESTING, jnp.array(0.0))
+    after = predict(belief, params, jnp.array(0.0), NONE, RESTING, jnp.array(0.0), UNREST)
     np.testing.assert_allclose(after.mean, belief.mean, atol=1e-6)
     assert np.isfinite(after.cov).all()
 
@@ -130,7 +142,7 @@ def test_white_acceleration_noise_is_that_of_the_exact_discretisation(params):
 def test_predicted_covariance_is_symmetric_and_not_negative(measured, dt, novelty):
     params = make_params(Settings(uwb=UwbSettings(max_beacons=NODES - 1)))
     belief = Gaussian(state(velocity=(1.0, 0.3), yaw_rate=0.5), 1e-4 * jnp.eye(SIZE))
-    after = predict(belief, params, jnp.float32(dt), measured, CARRIED, jnp.float32(novelty))
+    after = predict(belief, params, jnp.float32(dt), measured, CARRIED, jnp.float32(novelty), UNREST)
     P = np.asarray(after.cov, float)
     np.testing.assert_array_equal(P, P.T)
     scale = np.sqrt(np.diag(P))
@@ -154,16 +166,43 @@ def test_covariance_is_carried_by_the_jacobian_of_the_transition(params, measure
         axis=1,
     )
     zero = Gaussian(x, jnp.zeros((SIZE, SIZE)))
-    Q = predict(zero, params, dt, odometry, CARRIED, jnp.array(0.0)).cov
+    Q = predict(zero, params, dt, odometry, CARRIED, jnp.array(0.0), UNREST).cov
     belief = Gaussian(x, jnp.asarray(root @ root.T))
-    after = predict(belief, params, dt, odometry, CARRIED, jnp.array(0.0))
+    after = predict(belief, params, dt, odometry, CARRIED, jnp.array(0.0), UNREST)
     np.testing.assert_allclose(after.cov - Q, F @ (root @ root.T) @ F.T, atol=1e-8)  # of a central difference
+
+
+def test_motion_that_no_velocity_explains_widens_the_pose_and_nothing_else(params):
+    belief = Gaussian(state(velocity=(0.8, 0.3)), 1e-4 * jnp.eye(SIZE))
+    calm = predict(belief, params, jnp.array(0.1), NONE, RESTING, jnp.array(0.0), jnp.zeros(2))
+    restless = predict(belief, params, jnp.array(0.1), NONE, RESTING, jnp.array(0.0), jnp.array([0.04, 0.01]))
+    want = np.zeros(SIZE)
+    want[np.array(layout.pose_indices(NODES))] = 0.04, 0.04, 0.01
+    np.testing.assert_allclose(restless.cov - calm.cov, np.diag(want), atol=1e-8)  # float32
+    np.testing.assert_array_equal(restless.mean, calm.mean)
+    # an increment of the odometry is the motion: nothing is unexplained
+    wheels = odometry(0.1, 0.0, 0.0)
+    a, b = (
+        predict(belief, params, jnp.array(0.1), wheels, RESTING, jnp.array(0.0), u) for u in (want[:2], 0 * want[:2])
+    )
+    np.testing.assert_array_equal(a.cov, b.cov)
+
+
+def test_a_robot_not_seen_for_long_is_no_less_certain_than_a_robot_can_be(params):
+    belief = Gaussian(state(velocity=(0.8, 0.3), yaw_rate=0.5), 1e-4 * jnp.eye(SIZE))
+    for _ in range(20):
+        belief = predict(belief, params, jnp.array(1.0), NONE, RESTING, jnp.array(0.0), UNREST)
+    std = np.sqrt(np.diag(belief.cov))
+    heading = 4 * NODES
+    # the fastest: 1.5 m/s, 2 rad/s, and 2 rad is any heading
+    np.testing.assert_allclose(std[[2 * NODES, 2 * NODES + 1, heading, heading + 1]], [1.5, 1.5, 2.0, 2.0], rtol=1e-5)
+    assert np.linalg.eigvalsh(belief.cov / np.outer(std, std)).min() > -1e-6  # float32
 
 
 def test_map_error_forgets_with_novelty_and_falls_back_to_its_stationary_spread(params):
     rows = np.array(layout.map_error_indices(NODES))
     belief = Gaussian(state(map_error=(0.3, 0.2, 0.01)), jnp.zeros((SIZE, SIZE)))
-    after = predict(belief, params, jnp.array(0.1), NONE, RESTING, jnp.array(1.0))
+    after = predict(belief, params, jnp.array(0.1), NONE, RESTING, jnp.array(1.0), UNREST)
     np.testing.assert_array_equal(after.mean[rows], np.zeros(3))
     spread = [float(params.sigma_map)] * 2 + [float(params.sigma_map_yaw)]
     np.testing.assert_allclose(np.sqrt(np.diag(after.cov)[rows]), spread, rtol=1e-4)  # + 1e-12 of its own
@@ -182,7 +221,7 @@ def test_gradient_of_a_prediction_agrees_with_finite_differences(params, measure
         mean, sigma_w, sigma_map, dt, increment = at
         changed = params._replace(sigma_w=sigma_w, sigma_map=sigma_map)
         odometry = Odometry(increment, jnp.array(measured is not None))
-        after = predict(Gaussian(mean, root @ root.T), changed, dt, odometry, CARRIED, jnp.array(0.3))
+        after = predict(Gaussian(mean, root @ root.T), changed, dt, odometry, CARRIED, jnp.array(0.3), UNREST)
         return weights @ after.mean + jnp.sum(after.cov * jnp.outer(weights, weights))
 
     increment = jnp.array(measured or (0.0, 0.0, 0.0))
@@ -193,7 +232,7 @@ def test_gradient_of_a_prediction_agrees_with_finite_differences(params, measure
 def test_gradient_at_rest_without_odometry_is_finite(params):
     def value(mean):
         belief = Gaussian(mean, jnp.eye(SIZE))
-        after = predict(belief, double(params), jnp.array(0.1), NONE, RESTING, jnp.array(0.0))
+        after = predict(belief, double(params), jnp.array(0.1), NONE, RESTING, jnp.array(0.0), UNREST)
         return jnp.sum(after.mean) + jnp.sum(after.cov)
 
     assert np.isfinite(jax.grad(value)(double(state()))).all()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,8 +23,17 @@ from uwbslam_jax.measurements import Odometry, Ranges
 NODES = 4
 SIZE = layout.state_size(NODES)
 PAIRS = room.all_pairs(NODES)
+QUIET = ranging.quiet(NODES)
 predicted_ranges = jax.jit(ranging.predicted_ranges)
-update = jax.jit(ranging.update, static_argnames="robust")
+
+
+@partial(jax.jit, static_argnames="robust")
+def update(belief, ranges, usable, params, *, robust):
+    """The update between pairs that have been quiet so far."""
+    return ranging.update(
+        belief, ranges, usable, params, jax.tree.map(lambda x: x.astype(belief.mean.dtype), QUIET), robust=robust
+    )[:2]
+
 
 POSITIONS = np.array([[0.5, -0.3], [4.0, 0.0], [-3.0, 3.0], [1.0, -5.0]])
 VELOCITIES = np.array([[0.8, 0.4], [0.0, 0.0], [0.1, -0.2], [0.0, 0.0]])
@@ -35,6 +46,7 @@ def params() -> Params:
     return plain._replace(
         antenna=jnp.array([0.16, -0.05]),
         bias=jnp.array([0.02, 0.12, -0.03, 0.0]),
+        bias_scale=jnp.array(0.07),
         height=jnp.array([1.12, 1.94, 0.4, 1.12]),
     )
 
@@ -61,7 +73,8 @@ def by_hand(i: int, j: int, age: float, params: Params) -> float:
             place = place + np.array([np.cos(yaw) * ax - np.sin(yaw) * ay, np.sin(yaw) * ax + np.cos(yaw) * ay])
         return np.append(place, params.height[slot])
 
-    return float(np.linalg.norm(antenna(i) - antenna(j)) + params.bias[i] + params.bias[j])
+    distance = np.linalg.norm(antenna(i) - antenna(j))
+    return float((1 + params.bias_scale) * distance + params.bias[i] + params.bias[j])
 
 
 def measured(distances, ages=0.0, gap=np.nan, size=8) -> Ranges:
@@ -184,6 +197,40 @@ def test_robust_weight_is_a_quarter_at_three_sigma_and_bounds_the_pull():
     assert float(pull[-1]) < 0.01 * float(pull.max())
 
 
+def learnt(noise, count=200) -> np.ndarray:
+    """Factor of the noise of each pair after ranges with that noise, in standard deviations (count, 6)."""
+    ranges = measured(np.ones(6))
+    learn = jax.jit(ranging.learn_scatter)
+    scatter = QUIET
+    for z in noise[:count]:
+        scatter = learn(scatter, ranges, ranges.valid, jnp.asarray(np.append(z, [0.0, 0.0])))
+    np.testing.assert_array_equal(scatter.log, scatter.log.T)
+    return np.asarray(ranging.loudness(scatter.log[ranges.i, ranges.j]))[:6]
+
+
+def test_quiet_pairs_keep_their_weight():
+    rng = np.random.default_rng(0)
+    assert np.mean([learnt(rng.normal(size=(200, 6))) for _ in range(10)]) < 1.01
+
+
+def test_a_pair_through_walls_is_found_out_and_forgiven_when_they_are_passed():
+    rng = np.random.default_rng(0)
+    noise = rng.normal(size=(400, 6))
+    noise[:200, 2] += rng.exponential(8.0, 200)  # 0.8 m at 0.1 m of noise
+    factor = learnt(noise)
+    assert factor[2] > 4.0
+    assert np.delete(factor, 2).max() < 1.3
+    assert learnt(noise, 60)[2] > 3.0  # six seconds at 10 Hz
+    assert learnt(noise, 400).max() < 1.3
+
+
+def test_a_state_that_is_wrong_does_not_silence_the_ranges_that_say_so():
+    """The paper's Remark: innovations that are large but smooth are the state's fault, not the ranges'."""
+    rng = np.random.default_rng(0)
+    drifting = rng.normal(size=(100, 6)) + np.linspace(0.0, 20.0, 100)[:, None]
+    assert learnt(drifting).max() < 1.3
+
+
 @pytest.mark.parametrize("sign", [1.0, -1.0], ids=["too long", "too short"])
 def test_an_outlier_of_either_sign_hardly_moves_the_state(sign):
     belief = Gaussian(vector(), 0.01 * jnp.eye(SIZE))
@@ -205,13 +252,15 @@ def test_gradient_of_one_filter_step_agrees_with_finite_differences(params, robu
     none = Odometry(jnp.zeros(3), jnp.array(False))
     rng = np.random.default_rng(1)
     weights = jnp.asarray(rng.normal(size=SIZE))
-    names = ("sigma_n", "sigma_w", "sigma_w_yaw", "antenna", "bias", "height")
+    names = ("sigma_n", "sigma_w", "sigma_w_yaw", "antenna", "bias", "bias_scale", "height")
 
     def value(at):
         mean, root, distances, tunable = at
         changed = params._replace(**tunable)
         start = Gaussian(mean, root @ root.T)
-        predicted = motion.predict(start, changed, jnp.array(0.1), none, jnp.zeros(NODES, bool), jnp.array(0.0))
+        predicted = motion.predict(
+            start, changed, jnp.array(0.1), none, jnp.zeros(NODES, bool), jnp.array(0.0), jnp.zeros(2)
+        )
         after, used = update(predicted, ranges._replace(range=distances), ranges.valid, changed, robust=robust)
         return weights @ after.mean + weights @ after.cov @ weights + 0.1 * used.log_likelihood
 

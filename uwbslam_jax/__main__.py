@@ -19,6 +19,7 @@ COMMANDS = {
     "simulate": "write a recording of a ready-made scenario, with ground truth",
     "evaluate": "compare a run's folder with ground truth",
     "inspect": "tell what a recording holds",
+    "emulate": "serve a simulated robot's sensors, to try live without hardware",
 }
 """Name -> what it does, in a line."""
 

@@ -17,12 +17,14 @@ import tyro
 from tqdm import tqdm
 from tyro.conf import Positional, arg
 
+from uwbslam_drivers.device import DriverError
+from uwbslam_drivers.emulators.command import EmulateOptions, emulate
 from uwbslam_jax import settings_file
 from uwbslam_jax.config import ConfigError, Settings
 from uwbslam_jax.log_summary import format_summary, inspect
 from uwbslam_jax.mcap_log import LogError, LogReader, LogWriter
 from uwbslam_jax.measurements import Message, ScanMessage, TruthMessage
-from uwbslam_jax.metrics import Truth, evaluate
+from uwbslam_jax.metrics import Truth, consistency, evaluate
 from uwbslam_jax.outputs import RunError, read_run, write_result
 from uwbslam_jax.report import write_report
 from uwbslam_jax.result import Result
@@ -34,7 +36,7 @@ class UsageError(ValueError):
     """A request that cannot be met; the message is one line."""
 
 
-USER_ERRORS = (LogError, ConfigError, RunError, UsageError, OSError)
+USER_ERRORS = (LogError, ConfigError, RunError, DriverError, UsageError, OSError)
 """What a user can mend; the command line tells these in one line. Anything else is a defect of ours."""
 
 
@@ -186,6 +188,7 @@ _COMMANDS: dict[str, tuple[Any, Callable[[Any], None]]] = {
     "simulate": (SimulateOptions, simulate_scenario),
     "evaluate": (EvaluateOptions, evaluate_run),
     "inspect": (InspectOptions, inspect_log),
+    "emulate": (EmulateOptions, emulate),
 }
 
 
@@ -207,7 +210,7 @@ def _run_and_write(
     figures = None
     if truth is not None:
         beacons = {beacon.id: beacon.position for beacon in result.beacons}
-        figures = evaluate(result.stamps, result.poses, beacons, truth)
+        figures = evaluate(result.stamps, result.poses, beacons, truth) | consistency(result, truth)
     write_report(result, out / "report.html", figures, title or f"UWB and LiDAR SLAM: {log.name}")
     result.summary |= figures or {}
     write_result(result, out)
@@ -230,6 +233,8 @@ def _accuracy(figures: dict[str, Any]) -> Iterator[tuple[str, str]]:
         "beacon_mean_m": ("beacons, mean", "{:.3f} m"),
         "beacon_max_m": ("beacons, largest", "{:.3f} m"),
         "covered": ("share of the time covered", "{:.3f}"),
+        "pose_nees_ratio": ("pose, NEES / dof", "{:.2f}"),
+        "beacon_nees_ratio": ("beacons, NEES / dof", "{:.2f}"),
     }
     for key, (name, form) in named.items():
         if key in figures:

@@ -22,12 +22,13 @@ class Params(NamedTuple):
     """The tunable leaves, all differentiable. K = 1 + max_beacons slots, slot 0 is the robot.
 
     Attributes:
-      gamma, sigma_n, sigma_w, sigma_w_paper, sigma_w_yaw, sigma_w_beacon, sigma_l, independent_beams, sigma_map,
-        sigma_map_yaw: see FilterSettings and UwbSettings.
+      gamma, sigma_n, sigma_w, sigma_w_paper, sigma_w_yaw, sigma_w_beacon, sigma_w_carried, sigma_l, independent_beams,
+        sigma_map, sigma_map_yaw: see FilterSettings and UwbSettings.
       odom_sigma_xy, odom_sigma_yaw, odom_sigma_floor: see OdomSettings.
       antenna: x, y of the UWB antenna on the robot [m].
       lidar: pose of the LiDAR on the robot [m, m, rad].
       bias: (K,) range bias of each node [m].
+      bias_scale: excess of a range in proportion to the distance [m/m].
       height: (K,) height of each node's antenna [m].
     """
 
@@ -37,6 +38,7 @@ class Params(NamedTuple):
     sigma_w_paper: Float[Array, ""]
     sigma_w_yaw: Float[Array, ""]
     sigma_w_beacon: Float[Array, ""]
+    sigma_w_carried: Float[Array, ""]
     sigma_l: Float[Array, ""]
     independent_beams: Float[Array, ""]
     sigma_map: Float[Array, ""]
@@ -47,6 +49,7 @@ class Params(NamedTuple):
     antenna: Float[Array, "2"]
     lidar: Float[Array, "3"]
     bias: Float[Array, "K"]
+    bias_scale: Float[Array, ""]
     height: Float[Array, "K"]
 
 
@@ -108,6 +111,10 @@ class UwbSettings:
     """Height of a node's antenna above the floor by id [m]; where not given, that of the robot's antenna."""
     bias: dict[str, float] = field(default_factory=dict)
     """Range bias (antenna delay) of a node by id [m]; a pair's bias is the sum of both."""
+    bias_scale: float = 0.0
+    """Part of a range's bias that grows with the distance [m/m]: range = (1 + bias_scale) * distance + both biases."""
+    fit_offset: bool = False
+    """Whether the relative geometry of nodes at rest has a bias common to all ranges as an unknown."""
 
 
 @dataclass(frozen=True)
@@ -174,6 +181,8 @@ class FilterSettings:
     """Angular acceleration noise of the robot [rad/s^1.5]."""
     sigma_w_beacon: float = 1e-4
     """Random walk of a beacon at rest [m/s^0.5]."""
+    sigma_w_carried: float = 1.0
+    """Acceleration noise of a beacon that is being carried [m/s^1.5]."""
     sigma_l: float = 0.25
     """Standard deviation of one beam's residual 1 - Gamma."""
     independent_beams: float = 50.0
@@ -230,10 +239,10 @@ def make_params(settings: Settings, slots: dict[int, int] | None = None) -> Para
         bias[slot] = settings.uwb.bias.get(str(node), 0.0)
         if slot > 0:
             height[slot] = settings.uwb.height.get(str(node), settings.robot.antenna[2])
-    of_filter = ("gamma", "sigma_w", "sigma_w_paper", "sigma_w_yaw", "sigma_w_beacon", "sigma_l")
+    of_filter = ("gamma", "sigma_w", "sigma_w_paper", "sigma_w_yaw", "sigma_w_beacon", "sigma_w_carried")
     leaves: dict[str, Any] = {name: getattr(f, name) for name in of_filter}
-    leaves |= {name: getattr(f, name) for name in ("independent_beams", "sigma_map", "sigma_map_yaw")}
+    leaves |= {name: getattr(f, name) for name in ("sigma_l", "independent_beams", "sigma_map", "sigma_map_yaw")}
     leaves |= {f"odom_{name}": getattr(odom, name) for name in ("sigma_xy", "sigma_yaw", "sigma_floor")}
     leaves |= {"sigma_n": settings.uwb.sigma_n, "antenna": settings.robot.antenna[:2], "lidar": settings.robot.lidar}
-    leaves |= {"bias": bias, "height": height}
+    leaves |= {"bias": bias, "bias_scale": settings.uwb.bias_scale, "height": height}
     return Params(**{name: jnp.asarray(value, jnp.float32) for name, value in leaves.items()})

@@ -1,7 +1,8 @@
 """Host messages to frames: what arrived between two scans becomes one padded set of measurements.
 
-The assembler closes a frame when a scan arrives (ranges and odometry up to its stamp belong to it), or when no scan
-has come for a while and ranges wait. It gives every node id a slot, checks stamps and counts what it drops.
+The assembler closes a frame when a scan arrives (ranges and odometry up to its stamp belong to it). While no scan comes
+the odometry's stamps make the frames, and where there is no odometry either, ranges that have waited long enough. It
+gives every node id a slot, checks stamps and counts what it drops.
 """
 
 from __future__ import annotations
@@ -28,6 +29,12 @@ from uwbslam_jax.measurements import (
 
 _SCANLESS_S = 1.0
 """Ranges wait this long for a scan before they make a frame of their own."""
+_WITHOUT_SCAN_S = 3.0
+"""After so long without a scan the odometry makes the frames."""
+_ODOMETRY_EVERY_S = 0.08
+"""Frames made by the odometry are at least so far apart."""
+_ODOMETRY_LAGS_S = 15.0
+"""Ranges wait this long for odometry that has come before."""
 _ODOMETRY_HOLD_S = 0.3
 """The last odometry is extrapolated at most this far."""
 
@@ -53,6 +60,7 @@ class FrameAssembler:
         self._newest_range: dict[tuple[int, int], int] = {}
         self._odometry: list[OdometryMessage] = []
         self._last: int | None = None
+        self._scan_at: int | None = None
 
     def frames(self, messages: Iterable[Message]) -> Iterator[StampedFrame]:
         """Frames of a whole stream of messages."""
@@ -61,23 +69,25 @@ class FrameAssembler:
         yield from self.flush()
 
     def add(self, message: Message) -> list[StampedFrame]:
-        """Frames that a message completes: none, a scan's, or those of ranges that waited too long."""
+        """Frames that a message completes: none, a scan's, or those of odometry and ranges that waited too long."""
         match message:
             case ScanMessage():
                 return self._add_scan(message)
             case RangeMessage():
                 return self._add_range(message)
             case OdometryMessage():
-                self._add_odometry(message)
+                return self._add_odometry(message)
             case TruthMessage():
                 pass
         return []
 
     def flush(self) -> list[StampedFrame]:
-        """Frames of the ranges that no scan came for, at the end of a stream."""
-        return self._without_scan(before=None) if self._ranges else []
+        """Frames of the ranges and the odometry that no scan came for, at the end of a stream."""
+        frames = self._by_odometry(self._odometry[-1].stamp + 1) if self._odometry else []
+        return frames + (self._without_scan(before=None) if self._ranges else [])
 
     def _add_scan(self, scan: ScanMessage) -> list[StampedFrame]:
+        self._scan_at = max(scan.stamp, self._scan_at or scan.stamp)
         if self._last is not None and scan.stamp <= self._last:
             self.dropped["scan: stamp not after the one before"] += 1
             return []
@@ -109,30 +119,37 @@ class FrameAssembler:
             return []
         self._newest_range[pair] = message.stamp
         self._ranges.append(message)
-        if message.stamp - (self._last or self._ranges[0].stamp) > _SCANLESS_S * 2e9 and not self._expects_scan(
-            message.stamp
-        ):
+        # where there is odometry it makes the frames; one that lags is waited for, or they would lack its increment
+        patience = _ODOMETRY_LAGS_S if self._odometry else 2 * _SCANLESS_S
+        if message.stamp - (self._last or self._ranges[0].stamp) > patience * 1e9:
             return self._without_scan(before=message.stamp)
         return []
 
-    def _expects_scan(self, stamp: int) -> bool:
-        # odometry that lags behind the ranges would leave a frame without its increment: wait for it
-        return (
-            bool(self._odometry)
-            and stamp - self._odometry[-1].stamp > _ODOMETRY_HOLD_S * 1e9
-            and stamp - (self._last or stamp) < 15e9
-        )
-
-    def _add_odometry(self, message: OdometryMessage) -> None:
+    def _add_odometry(self, message: OdometryMessage) -> list[StampedFrame]:
         if not self._settings.odom.use:
-            return
+            return []
         if not np.isfinite([message.x, message.y, message.yaw]).all():
             self.dropped["odometry: not finite"] += 1
-            return
+            return []
         if self._odometry and message.stamp <= self._odometry[-1].stamp:
             self.dropped["odometry: stamp not after the one before"] += 1
-            return
+            return []
         self._odometry.append(message)
+        return self._by_odometry(message.stamp)  # the newest waits for the ranges of its own time
+
+    def _by_odometry(self, before: int) -> list[StampedFrame]:
+        """Frames at the odometry's own stamps while no scan comes: the turn between two is then measured, not assumed
+        to be even."""
+        if self._scan_at is None:
+            self._scan_at = self._odometry[0].stamp
+        frames = []
+        if self._odometry[-1].stamp - self._scan_at > _WITHOUT_SCAN_S * 1e9:
+            for stamp in [m.stamp for m in self._odometry if m.stamp < before]:
+                if self._last is None or stamp - self._last >= _ODOMETRY_EVERY_S * 1e9:
+                    ready = [m for m in self._ranges if m.stamp <= stamp]
+                    self._ranges = [m for m in self._ranges if m.stamp > stamp]
+                    frames.append(self._close(stamp, ready, None))
+        return frames
 
     def _slot(self, node: int) -> int | None:
         if node not in self.slots:

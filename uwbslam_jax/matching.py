@@ -28,7 +28,9 @@ _SEARCH_BEAMS = 180
 _SEARCH_REFINED = 8
 _UNLIKELY = 0.005
 """What a squared Mahalanobis distance of one costs a searched place, in mean Gamma: as if 100 beams were independent.
-Headings cost nothing: the search is for a robot that turned."""
+Headings cost little: the search is for a robot that turned."""
+_TURN = 1.0
+"""A turn that counts as a distance of one [rad]."""
 
 
 class Match(NamedTuple):
@@ -37,12 +39,14 @@ class Match(NamedTuple):
     Attributes:
       pose: (3,) the robot's pose in the map [m, m, rad].
       information: (3, 3) Gram matrix of the residuals at that pose, unscaled (H^(LiD) of the paper).
+      informed: (2, 2) projector on the directions in which it tells the position.
       score: mean Gamma of the returns that fall on observed cells; about 0.8 when right, 0.4 when not.
       known: share of the returns that fall on observed cells.
     """
 
     pose: Float[Array, "3"]
     information: Float[Array, "3 3"]
+    informed: Float[Array, "2 2"]
     score: Float[Array, ""]
     known: Float[Array, ""]
 
@@ -59,13 +63,21 @@ class Blind(NamedTuple):
     weight: Float[Array, ""]
 
 
-def blind_direction(sweep: Sweep) -> Blind:
-    """From the scan alone: the least eigenvector of the mean n n^T of its surface normals (DESIGN 1.8).
+class Surface(NamedTuple):
+    """Where the beams of a scan meet surfaces whose direction can be told.
 
-    The map cannot tell. The cells of a straight wall form a pattern along it, to which a scan locks: HectorSLAM
-    shortens corridors. A normal comes from the two neighbours of a beam that are far enough apart for range noise not
-    to matter; where the three are not on one line there is no surface, and no normal.
+    Attributes:
+      tangent: (B, 2) unit vector along the surface in the robot's frame, 0 where there is none.
+      found: (B,) whether there is one.
     """
+
+    tangent: Float[Array, "B 2"]
+    found: Bool[Array, "B"]
+
+
+def surface(sweep: Sweep) -> Surface:
+    """Surface directions from the two neighbours of a beam that are far enough apart for range noise not to matter;
+    where the three are not on one line there is no surface."""
     # what is seen is a decision, held when the step is differentiated
     points, valid = jax.lax.stop_gradient(sweep.points), sweep.valid
     tangent = jnp.zeros_like(points)
@@ -80,10 +92,24 @@ def blind_direction(sweep: Sweep) -> Blind:
         ok = ok & (span > _NORMAL_SPAN[0]) & (span < _NORMAL_SPAN[1]) & (bend < 0.05 + 0.1 * span) & ~found
         tangent = jnp.where(ok[:, None], t / jnp.maximum(span, 1e-6)[:, None], tangent)
         found = found | ok
+    return Surface(tangent, found)
+
+
+def blind_direction(surface: Surface, counted: Bool[Array, "B"]) -> Blind:
+    """From the scan alone: the least eigenvector of the mean n n^T of its surface normals (DESIGN 1.8).
+
+    The map cannot tell. The cells of a straight wall form a pattern along it, to which a scan locks: HectorSLAM
+    shortens corridors.
+
+    Args:
+      counted: beams that take part.
+    """
+    counted = counted & surface.found
+    tangent = jnp.where(counted[:, None], surface.tangent, 0.0)
     T = tangent.T @ tangent  # of tangents: its largest eigenvector is where the walls run
-    share, directions = jnp.linalg.eigh(T / jnp.maximum(jnp.sum(found), 1))
+    share, directions = jnp.linalg.eigh(T / jnp.maximum(jnp.sum(counted), 1))
     weight = jnp.clip((_BLIND[1] - share[0]) / (_BLIND[1] - _BLIND[0]), 0.0, 1.0)
-    return Blind(directions[:, 1], jnp.where(jnp.sum(found) > 20, weight, 0.0))
+    return Blind(directions[:, 1], jnp.where(jnp.sum(counted) > 20, weight, 0.0))
 
 
 def seen(blind: Blind, heading: Float[Array, ""]) -> Float[Array, "2 2"]:
@@ -143,26 +169,50 @@ def align(
     return pose
 
 
-def assess(grid: Grid, sweep: Sweep, blind: Blind, pose: Float[Array, "3"], resolution: float) -> Match:
-    """Score and information of a pose against the finest level; no information where the scan is blind."""
-    level, origin = grid.levels[0], grid.origin
-    gram = lidar_gram(pose, level, origin, resolution, sweep.points, sweep.valid)
+def assess(grid: Grid, sweep: Sweep, surface: Surface, pose: Float[Array, "3"], resolution: float) -> Match:
+    """Score and information of a pose against the finest level.
+
+    There is no information in the direction in which what the map has of the scan's walls is blind: the end of a
+    corridor tells nothing before it is drawn.
+    """
+    gram = lidar_gram(pose, grid.levels[0], grid.origin, resolution, sweep.points, sweep.valid)
+    score, known = fit(grid, sweep, pose, resolution)
     ends = transform_points(pose, sweep.points)
-    corners, at, inside = occupancy.corner_log_odds(level, origin, resolution, ends)
+    on_wall, _ = on_known_wall(grid, ends, resolution, min(1, len(grid.levels) - 1))
+    informed = seen(blind_direction(surface, sweep.valid & on_wall), pose[2])
+    projector = jnp.eye(3).at[:2, :2].set(informed)
+    information = projector @ gram[:3, :3] @ projector
+    return Match(pose, information, informed, score, known)
+
+
+def fit(
+    grid: Grid, sweep: Sweep, pose: Float[Array, "3"], resolution: float
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Score and known share of a scan at a pose, see Match, against the finest level."""
+    ends = transform_points(pose, sweep.points)
+    corners, at, inside = occupancy.corner_log_odds(grid.levels[0], grid.origin, resolution, ends)
     value, _ = occupancy.interpolate(jax.nn.sigmoid(corners), at, resolution)
     observed = sweep.valid & inside & jnp.any(corners != 0, axis=(1, 2))
     count = jnp.sum(observed)
     score = jnp.sum(jnp.where(observed, value, 0.0)) / jnp.maximum(count, 1)
-    projector = jnp.eye(3).at[:2, :2].set(seen(blind, pose[2]))
-    return Match(pose, projector @ gram[:3, :3] @ projector, score, count / jnp.maximum(jnp.sum(sweep.valid), 1))
+    return score, count / jnp.maximum(jnp.sum(sweep.valid), 1)
+
+
+def on_known_wall(
+    grid: Grid, ends: Float[Array, "B 2"], resolution: float, level: int
+) -> tuple[Bool[Array, "B"], Bool[Array, "B"]]:
+    """Whether any of the four cells of a level around a place is a wall, and whether it is in the window."""
+    size = resolution * 2**level
+    corners, _, inside = occupancy.corner_log_odds(grid.levels[level], grid.origin, size, ends)
+    return inside & jnp.any(corners > 0, axis=(1, 2)), inside
 
 
 def search(
     grid: Grid,
     sweep: Sweep,
-    blind: Blind,
+    surface: Surface,
     prior: Gaussian,
-    last: Float[Array, "3"],
+    known: tuple[Float[Array, "3"], Float[Array, "3"]],
     sigma_l: Float[Array, ""],
     resolution: float,
 ) -> Float[Array, "3"]:
@@ -170,8 +220,14 @@ def search(
     and around the last pose, because a robot that turned has often driven less far than its velocity said.
 
     Every heading and position is scored at the middle level; the best of each peak over the headings is aligned and
-    scored at the finest.
+    scored at the finest, where it has to be better than the pose that was found without searching.
+
+    Args:
+      prior: mean and covariance of the pose expected; its position weighs in the choice, its heading does not.
+      known: the last pose, and the pose found without searching.
     """
+    last, found = known
+    blind = blind_direction(surface, sweep.valid)
     k = min(1, len(grid.levels) - 1)
     size = resolution * 2**k
     stride = max(1, sweep.points.shape[0] // _SEARCH_BEAMS)
@@ -198,14 +254,17 @@ def search(
     peak = (value >= jnp.roll(value, 1)) & (value >= jnp.roll(value, -1))
     _, best = jax.lax.top_k(jnp.where(peak, value, -jnp.inf), _SEARCH_REFINED)
     starts = jnp.concatenate([places[best_place[best]], headings[best, None]], axis=1)
+    starts = jnp.concatenate([found[None], starts])
+    information = jnp.linalg.inv(prior.cov[:2, :2])
 
     def refine(start):
-        wide = Gaussian(start, prior.cov * 0 + jnp.diag(jnp.array([0.3, 0.3, 0.3]) ** 2))
+        wide = Gaussian(start, jnp.diag(jnp.array([0.3, 0.3, 0.3]) ** 2))
         pose = align(grid, sweep, blind, start, wide, sigma_l, resolution)
-        m = assess(grid, sweep, blind, pose, resolution)
+        m = assess(grid, sweep, surface, pose, resolution)
         away = pose[None, :2] - centres
-        unlikely = jnp.sum(away * jnp.linalg.solve(prior.cov[:2, :2], away.T).T, axis=1)
-        return pose, (m.score - 0.5) * m.known - _UNLIKELY * jnp.min(unlikely)
+        turned = wrap_angle(pose[2] - jnp.stack([prior.mean[2], last[2]])) / _TURN
+        unlikely = jnp.min(jnp.sum((away @ information) * away, axis=1)) + jnp.min(turned**2)
+        return pose, (m.score - 0.5) * m.known - _UNLIKELY * unlikely
 
     poses, values = jax.lax.map(refine, starts)
     pose = poses[jnp.argmax(values)]

@@ -55,7 +55,8 @@ class LogReader:
           max_range: longer ranges are dropped and counted [m].
 
         Raises:
-          LogError: the file cannot be read, has no scans, leaves a choice open, or a named topic holds something else.
+          LogError: the file cannot be read, has neither scans nor odometry nor ranges, leaves a choice open, or a named
+            topic holds something else.
         """
         self._recording = Recording(path)
         self._options = Options(robot_id, max_range)
@@ -63,8 +64,9 @@ class LogReader:
         wanted: dict[Role, str | None] = {"scan": scan_topic, "uwb": uwb_topic, "odom": odom_topic}
         try:
             self._decoders, self._roles = choose_topics(self._recording, wanted, self._options)
-            if scan_topic is not None and "scan" not in self._roles.values():
-                raise LogError(f"no scan topic ({scan_topic} or any LaserScan); {_listing(self._recording)}")
+            if scan_topic is not None and not {"scan", "uwb", "odom"} & set(self._roles.values()):
+                wanted_scan = f"{scan_topic} or any LaserScan"
+                raise LogError(f"no scan topic ({wanted_scan}), no odometry and no ranges; {_listing(self._recording)}")
         except LogError as error:
             broken = f"; {self._recording.truncated}" if self._recording.truncated else ""
             raise LogError(f"{self.path}: {' '.join(str(error).split())}{broken}") from None
@@ -72,7 +74,7 @@ class LogReader:
         self.topics: dict[str, Role] = {channels[number].topic: role for number, role in self._roles.items()}
         self.warnings: list[str] = []
         if uwb_topic is not None and "uwb" not in self._roles.values():
-            self.warnings.append("no UWB topic: LiDAR only")
+            self.warnings.append(f"no UWB topic: {'LiDAR' if 'scan' in self._roles.values() else 'odometry'} only")
         self.duration = (self._recording.end - self._recording.start) * 1e-9
         counts = self._recording.counts
         self.message_count = sum(counts[number] for number in self._roles)

@@ -17,12 +17,22 @@ _SOFT = 3.0
 """Normalised innovation at which a range weighs a quarter (Geman-McClure)."""
 
 
+_QUIET = 1.6
+"""A pair that scatters less than this many times as much as its radios should is taken to be quiet."""
+_LEARN = 0.1
+"""Logarithm by which a pair's scatter moves with one range, at most twice that apart: some 40 ranges for a factor 8."""
+_NORMAL_MEDIAN = 0.674
+_SCATTER_LIMITS = (-0.7, 2.5)
+_LOUDEST = 10.0
+"""However much a pair scatters, its noise counts as this many times that of a quiet one at most."""
+
+
 class RangeUpdate(NamedTuple):
     """What one frame's ranges did.
 
     Attributes:
       innovation: (M,) measured minus predicted [m], 0 where there is no range.
-      normalised: (M,) innovation over its predicted standard deviation.
+      normalised: (M,) innovation over its predicted standard deviation, the pair's own scatter included.
       weight: (M,) robust weight in [0, 1]; 0 where a range is not used.
       log_likelihood: of the innovations, each pair by itself, under the robust model.
     """
@@ -34,7 +44,8 @@ class RangeUpdate(NamedTuple):
 
 
 def predicted_ranges(vector: Float[Array, "n"], ranges: Ranges, params: Params) -> Float[Array, "M"]:
-    """h = |p_i - p_j| + biases, at the time of each exchange [m] (paper, "dynamical and observational models").
+    """h = |p_i - p_j| (1 + scale) + biases, at the time of each exchange [m] (paper, "dynamical and observational
+    models").
 
     The antenna's lever arm on the robot, the difference of antenna heights and the motion between exchange and
     frame are part of the model; two nodes at one place give a finite gradient.
@@ -48,7 +59,7 @@ def predicted_ranges(vector: Float[Array, "n"], ranges: Ranges, params: Params) 
     def one(i, j, age):
         flat = safe_norm(at_exchange(i, age) - at_exchange(j, age))
         rise = params.height[i] - params.height[j]
-        return safe_norm(jnp.stack([flat, rise])) + params.bias[i] + params.bias[j]
+        return (1.0 + params.bias_scale) * safe_norm(jnp.stack([flat, rise])) + params.bias[i] + params.bias[j]
 
     return jax.vmap(one)(ranges.i, ranges.j, ranges.age)
 
@@ -64,21 +75,88 @@ def robust_weight(normalised: Float[Array, "*m"]) -> Float[Array, "*m"]:
     return (1.0 / (1.0 + (normalised / _SOFT) ** 2)) ** 2
 
 
+class Scatter(NamedTuple):
+    """What each pair's ranges did so far; symmetric.
+
+    Attributes:
+      log: (K, K) log of how many times as much its innovations jump from one range to the next as its noise lets them.
+      last: (K, K) the last innovation over its standard deviation, NaN before there was one.
+    """
+
+    log: Float[Array, "K K"]
+    last: Float[Array, "K K"]
+
+
+def quiet(nodes: int) -> Scatter:
+    """Scatter before anything was heard."""
+    return Scatter(jnp.zeros((nodes, nodes), jnp.float32), jnp.full((nodes, nodes), jnp.nan, jnp.float32))
+
+
+def loudness(log: Float[Array, "*m"]) -> Float[Array, "*m"]:
+    """How many times sigma_n the noise of a pair is by the log of its scatter; 1 for a quiet pair.
+
+    It grows with the square of the scatter: what makes ranges jump (walls in between) also makes them too long, by
+    an amount that nobody knows.
+    """
+    return jnp.clip((jnp.exp(log) / _QUIET) ** 2, 1.0, _LOUDEST)
+
+
+def learn_scatter(scatter: Scatter, ranges: Ranges, usable: Bool[Array, "M"], normalised: Float[Array, "M"]) -> Scatter:
+    """Scatter of each pair after a frame: log of the median |jump| of its innovations over what noise should give.
+
+    Ranges through walls are too long by amounts that vary, mostly by much and sometimes by little; their robust
+    weight alone would let the small ones pull for ever to one side. A running median (Robbins-Monro, its sign
+    smoothed so that it can be differentiated) makes the whole pair weigh what it is worth, and forgets when the wall
+    is passed. Only jumps count: where the state is wrong, innovations are large but smooth, and ranges must not be
+    silenced by the very error that they are there to mend (paper, Remark on innovation gates).
+
+    Args:
+      normalised: innovations over their standard deviation for quiet pairs.
+    """
+    before = scatter.last[ranges.i, ranges.j]
+    jump = (normalised - before) / jnp.sqrt(2.0)
+    known = usable & jnp.isfinite(before)
+    median = _NORMAL_MEDIAN * jnp.exp(scatter.log[ranges.i, ranges.j])
+    square = jnp.where(known, jump / median, 1.0) ** 2
+    move = jnp.where(known, _LEARN * (1.0 - 2.0 / (1.0 + square**2)), 0.0)
+    log = scatter.log.at[ranges.i, ranges.j].add(move).at[ranges.j, ranges.i].add(move)
+    # a slot without a range must not overwrite a pair that has one
+    i, j = (jnp.where(usable, slot, scatter.log.shape[0]) for slot in (ranges.i, ranges.j))
+    last = scatter.last.at[i, j].set(normalised, mode="drop").at[j, i].set(normalised, mode="drop")
+    return Scatter(jnp.clip(log, *_SCATTER_LIMITS), last)
+
+
 def update(
-    belief: ekf.Gaussian, ranges: Ranges, usable: Bool[Array, "M"], params: Params, *, robust: bool
-) -> tuple[ekf.Gaussian, RangeUpdate]:
-    """EKF update by all usable ranges of a frame in information form (paper, "EKF update")."""
+    belief: ekf.Gaussian,
+    ranges: Ranges,
+    usable: Bool[Array, "M"],
+    params: Params,
+    scatter: Scatter,
+    *,
+    robust: bool,
+) -> tuple[ekf.Gaussian, RangeUpdate, Scatter]:
+    """EKF update by all usable ranges of a frame in information form (paper, "EKF update").
+
+    Args:
+      scatter: of each pair, see learn_scatter; without `robust` it stays as it is and is not used.
+    """
     h = predicted_ranges(belief.mean, ranges, params)
     H = jax.jacfwd(predicted_ranges)(belief.mean, ranges, params)
     H = jnp.where(usable[:, None], H, 0.0)
     innovation = jnp.where(usable, ranges.range - h, 0.0)
-    S = jnp.sum((H @ belief.cov) * H, axis=1) + params.sigma_n**2
+    spread = jnp.sum((H @ belief.cov) * H, axis=1)
+    variance = params.sigma_n**2
+    if robust:
+        quiet = innovation / jnp.sqrt(spread + variance)
+        variance = variance * loudness(scatter.log[ranges.i, ranges.j]) ** 2
+        scatter = learn_scatter(scatter, ranges, usable, quiet)
+    S = spread + variance
     normalised = innovation / jnp.sqrt(S)
     weight = jnp.where(usable, robust_weight(normalised) if robust else 1.0, 0.0)
-    scaled = H * (weight / params.sigma_n**2)[:, None]
+    scaled = H * (weight / variance)[:, None]
     log_likelihood = jnp.sum(jnp.where(usable, _log_density(normalised, S, robust), 0.0))
     after = ekf.update_information(belief, H.T @ scaled, scaled.T @ innovation)
-    return after, RangeUpdate(innovation, normalised, weight, log_likelihood)
+    return after, RangeUpdate(innovation, normalised, weight, log_likelihood), scatter
 
 
 def _log_density(normalised, S, robust):

@@ -24,6 +24,7 @@ _COLORS = {  # of a beacon, by status
     "moving": (0.9, 0.5, 0.0),
     "silent": (0.5, 0.5, 0.5),
     "dropped": (0.8, 0.1, 0.1),
+    "relative": (0.2, 0.45, 0.8),
 }
 
 

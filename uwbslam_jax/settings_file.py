@@ -22,6 +22,7 @@ _POSITIVE = [
         "filter.sigma_w_paper",
         "filter.sigma_w_yaw",
         "filter.sigma_w_beacon",
+        "filter.sigma_w_carried",
         "filter.sigma_l",
         "filter.independent_beams",
     ),
@@ -34,6 +35,7 @@ _LIMITS = {
     "uwb.max_beacons": (1, 200),
     "lidar.max_beams": (1, 100_000),
     "map.levels": (1, 5),
+    "uwb.bias_scale": (-0.5, 1.0),
 }
 
 

@@ -10,15 +10,14 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from uwbslam_jax import grid as occupancy
-from uwbslam_jax import layout, matching, motion, paper, ranging
+from uwbslam_jax import layout, matching, motion, paper, ranging, trust
 from uwbslam_jax.config import Config, Params
-from uwbslam_jax.ekf import Gaussian, update_information
+from uwbslam_jax.ekf import Gaussian
 from uwbslam_jax.geometry import rotation, transform_points, wrap_angle
 from uwbslam_jax.grid import Grid, Sweep
 from uwbslam_jax.matching import Match
@@ -30,10 +29,11 @@ _POOR_SCORE = 0.55
 _FOUND_KNOWN = 0.4
 """A place found by the search is believed only where this share of the returns falls on observed cells."""
 _LOST_SCORE = 0.5
-_SURPRISE = 30.0
-"""Squared Mahalanobis distance of a match beyond which it is not believed (chi-square, 3: 1e-6)."""
-_MATCH_FLOOR = (0.004, 0.004, 0.0006)
-"""Error of any match beyond what its Hessian tells: cells, drawn walls [m, m, rad]."""
+_FINE_SCORE = 0.8
+_WIDE_HEADING = 0.15
+"""A heading less certain than this [rad] is searched for unless the scan fits finely where it was expected."""
+_FEWEST_RETURNS = 20
+"""A scan of fewer returns is not worth a search."""
 _ALIGN_FLOOR = (0.1, 0.1, 0.05)
 """Alignment is LiDAR's business: the prior that holds it is never tighter than this [m, m, rad]."""
 _DRAW_MOVED = (0.1, 0.05)
@@ -54,20 +54,24 @@ class State(NamedTuple):
       active: (K,) slots in use, the robot's always.
       moving: (K,) nodes taken to be carried about.
       frame_slots: (2,) the beacons that make the published frame, for preset "paper".
+      scatter: how much each pair's ranges scatter, see ranging.learn_scatter.
       grid: the map's window.
       drawn_pose: (3,) where the last scan was drawn.
       scans_drawn: how many were.
       novelty: share of the last drawn scan that fell on new ground.
+      unrest: variance of the motion between two scans that no velocity explains, see trust.learn_unrest [m^2, rad^2].
     """
 
     belief: Gaussian
     active: Bool[Array, "K"]
     moving: Bool[Array, "K"]
     frame_slots: Int[Array, "2"]
+    scatter: ranging.Scatter
     grid: Grid
     drawn_pose: Float[Array, "3"]
     scans_drawn: Int[Array, ""]
     novelty: Float[Array, ""]
+    unrest: Float[Array, "2"]
 
 
 class Estimate(NamedTuple):
@@ -120,10 +124,12 @@ def init(config: Config) -> State:
         active=jnp.zeros(config.nodes, bool).at[0].set(True),
         moving=jnp.zeros(config.nodes, bool),
         frame_slots=jnp.array([1, 2], jnp.int32),
+        scatter=ranging.quiet(config.nodes),
         grid=occupancy.empty(config.cells, config.levels, config.resolution),
         drawn_pose=jnp.zeros(3, jnp.float32),
         scans_drawn=jnp.zeros((), jnp.int32),
         novelty=jnp.zeros((), jnp.float32),
+        unrest=jnp.array(trust.CALM, jnp.float32) ** 2,
     )
 
 
@@ -134,21 +140,23 @@ def step(config: Config, params: Params, state: State, frame: Frame) -> tuple[St
     """
     belief = _predict(config, params, state, frame)
     usable = _usable(config, state, frame)
-    belief, used = ranging.update(belief, frame.ranges, usable, params, robust=config.preset == "robust")
+    robust = config.preset == "robust"
+    belief, used, scatter = ranging.update(belief, frame.ranges, usable, params, state.scatter, robust=robust)
+    state = state._replace(scatter=scatter)
     if config.preset == "paper":
         belief = paper.heading_from_velocity(paper.pin_frame(belief, state.frame_slots))
     s = layout.unpack(belief.mean)
     sweep = undo_motion(frame.scan, params.lidar, rotation(-s.heading) @ s.velocities[0], s.yaw_rate)
     align = _joint_match if config.preset == "paper" else _match_and_fuse
     belief, matched = align(config, params, state, belief, frame, sweep, usable)
-    state, drawn = _draw(config, state._replace(belief=belief), matched, sweep)
+    state, drawn = _draw(config, state._replace(belief=belief, unrest=matched.unrest), matched, sweep)
     return state, _report(state, matched, used, drawn)
 
 
 def _predict(config, params, state, frame) -> Gaussian:
     if config.preset == "paper":
         return paper.predict(state.belief, params, frame.dt)
-    return motion.predict(state.belief, params, frame.dt, frame.odometry, state.moving, state.novelty)
+    return motion.predict(state.belief, params, frame.dt, frame.odometry, state.moving, state.novelty, state.unrest)
 
 
 def _usable(config, state, frame) -> Bool[Array, "M"]:
@@ -158,26 +166,43 @@ def _usable(config, state, frame) -> Bool[Array, "M"]:
 
 
 class _Matched(NamedTuple):
-    """A match and what was made of it: the information it was given, and whether it may be drawn."""
+    """A match and what was made of it: the information it was given, whether it may be drawn, what it taught."""
 
     match: Match
     information: Float[Array, "3 3"]
     poor: Bool[Array, ""]
     searched: Bool[Array, ""]
     trusted: Bool[Array, ""]
+    unrest: Float[Array, "2"]
 
 
 def _match_and_fuse(config, params, state, belief, frame, sweep, usable) -> tuple[Gaussian, _Matched]:
     """Preset "robust": align the scan fully, search where that fails, fuse what it is worth (DESIGN 1.8, 1.9)."""
-    del usable  # the ranges are in the belief already: every measurement counts once
     match, searched = _match(config, params, state, belief, sweep, frame.has_scan)
-    surprise, information = _trust(match, belief, params, jnp.sum(sweep.valid))
-    poor = ((match.known > _KNOWN_ENOUGH) & (match.score < _LOST_SCORE)) | (surprise > _SURPRISE)
-    poor = poor | (searched & (match.known < _FOUND_KNOWN))
+    lost = (match.known > _KNOWN_ENOUGH) & (match.score < _LOST_SCORE)
+    lost = lost | (searched & (match.known < _FOUND_KNOWN))
+    sure = trust.is_sure(match) & frame.has_scan
+    needed = trust.needs_jump(match, _expected_fit(config, state, belief, sweep))
+    learning = sure & ~frame.odometry.valid
+    unrest = jnp.where(learning, trust.learn_unrest(state.unrest, match, belief, needed), state.unrest)
+    credible = sure & (needed | trust.restless(state.unrest))
+    credible = credible & ~trust.contradicted(match, belief, frame, usable, params)
+    belief = trust.allow_jump(belief, match, credible)
+    surprise, information = trust.weigh(match, belief, params, jnp.sum(sweep.valid))
+    poor = lost | (surprise > trust.SURPRISE)
     trusted = frame.has_scan & ~poor
     information = jnp.where(trusted, information, 0.0)
-    belief = _fuse(belief, match.pose, information)
-    return belief, _Matched(match, information, poor & frame.has_scan, searched, trusted)
+    belief = trust.fuse(belief, match, information)
+    # where the scan tells nothing the alignment has slid to wherever it liked: there the belief says where to draw
+    expected = trust.expected_match(belief)
+    place = expected[:2] + match.informed @ (match.pose[:2] - expected[:2])
+    match = match._replace(pose=match.pose.at[:2].set(place))
+    return belief, _Matched(match, information, poor & frame.has_scan, searched, trusted, unrest)
+
+
+def _expected_fit(config, state, belief, sweep) -> Float[Array, ""]:
+    score, known = matching.fit(state.grid, sweep, trust.expected_match(belief), config.resolution)
+    return score * known
 
 
 def _joint_match(config, params, state, belief, frame, sweep, usable) -> tuple[Gaussian, _Matched]:
@@ -188,11 +213,10 @@ def _joint_match(config, params, state, belief, frame, sweep, usable) -> tuple[G
         offset = paper.joint_match(state.grid, sweep, belief, frame.ranges, usable, free, params, config.resolution)
         offset = jnp.where(frame.has_scan, offset, 0.0)
     corrected = paper.correct(belief, offset)
-    blind = matching.Blind(jnp.zeros(2), jnp.zeros(()))  # the paper takes every match for what its Hessian says
     pose = layout.robot_pose(corrected.mean)
-    match = matching.assess(state.grid, sweep, blind, pose, config.resolution)
+    match = matching.assess(state.grid, sweep, matching.surface(sweep), pose, config.resolution)
     no = jnp.zeros((), bool)
-    matched = _Matched(match, jnp.zeros((3, 3)), no, no, frame.has_scan)
+    matched = _Matched(match, jnp.zeros((3, 3)), no, no, frame.has_scan, state.unrest)
     return corrected if config.correction else belief, matched
 
 
@@ -220,48 +244,25 @@ def _match(config, params, state, belief, sweep, has_scan) -> tuple[Match, Bool[
     C = layout.matched_pose_jacobian(config.nodes)
     prior = Gaussian(C @ belief.mean, C @ belief.cov @ C.T + jnp.diag(jnp.array(_ALIGN_FLOOR) ** 2))
     start = prior.mean
-    blind = matching.blind_direction(sweep)
+    surface = matching.surface(sweep)
+    blind = matching.blind_direction(surface, sweep.valid)
     pose = matching.align(state.grid, sweep, blind, start, prior, params.sigma_l, config.resolution)
-    match = matching.assess(state.grid, sweep, blind, pose, config.resolution)
-    wanted = has_scan & (match.known > _KNOWN_ENOUGH) & (match.score < _POOR_SCORE)
+    match = matching.assess(state.grid, sweep, surface, pose, config.resolution)
+    unsure = (belief.cov[4 * config.nodes, 4 * config.nodes] > _WIDE_HEADING**2) | trust.restless(state.unrest)
+    fits = match.score > jnp.where(unsure, _FINE_SCORE, _POOR_SCORE)
+    # on new ground a score says nothing, and a certain heading is believed
+    searchable = jnp.where(match.known > _KNOWN_ENOUGH, ~fits, unsure & (state.scans_drawn > _DRAW_FIRST))
+    wanted = has_scan & searchable & (jnp.sum(sweep.valid) > _FEWEST_RETURNS)
 
     def wide(_):
+        likely = prior._replace(cov=prior.cov - jnp.diag(jnp.array(_ALIGN_FLOOR) ** 2) * 0.75)
+        last = C @ state.belief.mean
         found = matching.search(
-            state.grid, sweep, blind, prior, C @ state.belief.mean, params.sigma_l, config.resolution
+            state.grid, sweep, surface, likely, (last, match.pose), params.sigma_l, config.resolution
         )
-        other = matching.assess(state.grid, sweep, blind, found, config.resolution)
-        better = (other.score - 0.5) * other.known > (match.score - 0.5) * match.known + 0.02
-        return jax.tree.map(lambda a, b: jnp.where(better, a, b), other, match)
+        return matching.assess(state.grid, sweep, surface, found, config.resolution)
 
     return lax.cond(wanted, wide, lambda _: match, None), wanted
-
-
-def _trust(
-    match: Match, belief: Gaussian, params: Params, beams: Int[Array, ""]
-) -> tuple[Float[Array, ""], Float[Array, "3 3"]]:
-    """How surprising a match is, and its information about pose + map error.
-
-    The information is its Hessian, for as many of its beams as count as independent, and never better than the floor
-    (Y^-1 + floor)^-1. The surprise is the squared Mahalanobis distance to what was expected; information falls with
-    it as with a range's (Geman-McClure), so that a plausible match of the wrong place cannot drag the state.
-    """
-    share = params.independent_beams / jnp.maximum(beams, params.independent_beams)
-    Y = match.information * (share / params.sigma_l**2)
-    floor = jnp.diag(jnp.array(_MATCH_FLOOR) ** 2)
-    Y = jnp.linalg.solve(jnp.eye(3) + Y @ floor, Y)
-    C = layout.matched_pose_jacobian(layout.node_count(belief.mean.shape[0]))
-    innovation = match.pose - C @ belief.mean
-    # nu^T (Pz + Y^-1)^-1 nu without the inverse of a Y that may be singular
-    surprise = innovation @ jnp.linalg.solve(jnp.eye(3) + Y @ (C @ belief.cov @ C.T), Y @ innovation)
-    return surprise, Y / (1.0 + surprise / _SURPRISE) ** 2
-
-
-def _fuse(belief: Gaussian, pose: Float[Array, "3"], information: Float[Array, "3 3"]) -> Gaussian:
-    """EKF update by a matched pose, of which the map's own error is a part (match hard, fuse soft; DESIGN 1.9)."""
-    C = layout.matched_pose_jacobian(layout.node_count(belief.mean.shape[0]))
-    innovation = pose - C @ belief.mean
-    innovation = innovation.at[2].set(wrap_angle(innovation[2]))
-    return update_information(belief, C.T @ information @ C, C.T @ (information @ innovation))
 
 
 def _draw(config, state, matched: _Matched, sweep) -> tuple[State, Bool[Array, ""]]:
@@ -286,10 +287,9 @@ def _draw(config, state, matched: _Matched, sweep) -> tuple[State, Bool[Array, "
 
 def _novelty(config, grid, sweep, pose):
     """Share of the returns that end where the coarsest level has no wall yet in any of the four cells around."""
-    k = len(grid.levels) - 1
     ends = transform_points(pose, sweep.points)
-    corners, _, inside = occupancy.corner_log_odds(grid.levels[k], grid.origin, config.resolution * 2**k, ends)
-    new = sweep.valid & inside & jnp.all(corners <= 0, axis=(1, 2))
+    on_wall, inside = matching.on_known_wall(grid, ends, config.resolution, len(grid.levels) - 1)
+    new = sweep.valid & inside & ~on_wall
     return jnp.sum(new) / jnp.maximum(jnp.sum(sweep.valid), 1)
 
 

@@ -1,0 +1,147 @@
+"""What a match is worth: surprise against what was expected, jumps that explain it, and what is learnt of them."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import small_room as room
+
+from uwbslam_jax import layout, trust
+from uwbslam_jax.config import Config, Params, Settings, UwbSettings, make_params
+from uwbslam_jax.ekf import Gaussian
+from uwbslam_jax.layout import Nodes
+from uwbslam_jax.matching import Match
+
+BEACONS = np.array([[-3.5, -2.5], [4.0, -2.0], [1.0, 3.0]])
+NODES = 4
+SIZE = layout.state_size(NODES)
+PAIRS = [(0, 1), (2, 0), (0, 3)]
+CONFIG = Config(NODES, 8, 60, 0.1, 2, 128, 10.0, "robust", True, True, False)
+PARAMS: Params = make_params(Settings(uwb=UwbSettings(max_beacons=3)))
+STD = 0.02
+CALM = jnp.array(trust.CALM) ** 2
+
+weigh, fuse, learn_unrest = jax.jit(trust.weigh), jax.jit(trust.fuse), jax.jit(trust.learn_unrest)
+allow_jump, contradicted = jax.jit(trust.allow_jump), jax.jit(trust.contradicted)
+
+
+def expecting(pose=(0.0, 0.0, 0.0), velocity=(0.0, 0.0)) -> Gaussian:
+    """The robot taken to be at a pose, 0.02 m and 0.02 rad certain; the map right."""
+    positions, velocities = np.vstack([pose[:2], BEACONS]), np.zeros((NODES, 2))
+    velocities[0] = velocity
+    nodes = Nodes(*(jnp.asarray(x, jnp.float32) for x in (positions, velocities, pose[2], 0.0, np.zeros(3))))
+    std = np.full(SIZE, 1e-3)
+    std[list(layout.pose_indices(NODES))] = STD
+    return Gaussian(layout.pack(nodes), jnp.asarray(np.diag(std**2), jnp.float32))
+
+
+def match(pose, score=0.85, known=1.0, informed=((1.0, 0.0), (0.0, 1.0))) -> Match:
+    """A scan with 1000 beams' worth of gradients of 3 per metre, as far as it is informed."""
+    projector = np.eye(3)
+    projector[:2, :2] = informed
+    information = projector @ np.diag([9e3, 9e3, 9e4]) @ projector
+    return Match(*(jnp.asarray(x, jnp.float32) for x in (pose, information, informed, score, known)))
+
+
+def frame(truth, dt=0.1, age=0.0):
+    z = room.distances(np.vstack([truth[:2], BEACONS]), PAIRS)
+    return room.frame(CONFIG, dt, None, room.ranges(PAIRS, z, CONFIG.max_ranges, age))
+
+
+def told(truth, pose, dt=0.1, age=0.0) -> bool:
+    """Whether ranges measured at one place contradict a match at another, the robot being expected at the origin."""
+    measured = jax.tree.map(jnp.asarray, frame(np.array(truth), dt, age))
+    return bool(contradicted(match(pose), expecting(), measured, measured.ranges.valid, PARAMS))
+
+
+def test_surprise_is_the_squared_mahalanobis_distance():
+    pose = np.array([0.05, -0.03, 0.01])
+    surprise, information = weigh(match(pose), expecting(), PARAMS, jnp.int32(1000))
+    # 50 of 1000 beams are independent; the map's own error (0.001) and the floor of any match come on top
+    Y = np.diag([9e3, 9e3, 9e4]) * 0.05 / 0.25**2
+    R = np.linalg.inv(Y) + np.diag([0.004, 0.004, 0.0006]) ** 2
+    S = np.eye(3) * (STD**2 + 1e-6) + R
+    want = pose @ np.linalg.solve(S, pose)
+    np.testing.assert_allclose(surprise, want, rtol=1e-3)  # float32
+    np.testing.assert_allclose(information, np.linalg.inv(R) / (1 + want / 30.0) ** 2, rtol=1e-3, atol=1e-2)
+
+
+def test_a_match_moves_the_pose_only_as_far_as_the_scan_can_tell():
+    """Along a corridor in x the alignment has slid by 0.3 m: that is not information and no surprise."""
+    slid = match((0.3, 0.01, 0.0), informed=np.diag([0.0, 1.0]))
+    surprise, information = weigh(slid, expecting(), PARAMS, jnp.int32(1000))
+    assert float(surprise) < 1.0
+    after = fuse(expecting(), slid, information)
+    np.testing.assert_allclose(after.mean[0], 0.0, atol=1e-6)
+    np.testing.assert_allclose(after.mean[1], 0.01, atol=0.003)
+
+
+def test_headings_are_compared_around_the_circle():
+    surprise, _ = weigh(match((0.0, 0.0, 2 * np.pi + 0.01)), expecting(), PARAMS, jnp.int32(1000))
+    assert float(surprise) < 1.0
+
+
+def test_a_jump_is_followed_and_leaves_the_velocity_alone():
+    jump = match((0.17, 0.0, 0.26))
+    before = expecting(velocity=(0.3, 0.0))
+    assert float(weigh(jump, before, PARAMS, jnp.int32(1000))[0]) > trust.SURPRISE
+    belief = allow_jump(before, jump, jnp.array(True))
+    surprise, information = weigh(jump, belief, PARAMS, jnp.int32(1000))
+    assert float(surprise) < 5.0  # as wide as the jump is far: three coordinates of one sigma or less
+    after = fuse(belief, jump, information)
+    np.testing.assert_allclose(layout.robot_pose(after.mean), jump.pose, atol=0.01)
+    np.testing.assert_allclose(layout.unpack(after.mean).velocities[0], [0.3, 0.0], atol=1e-3)
+    for same in (allow_jump(before, jump, jnp.array(False)), allow_jump(before, match((0.02, 0, 0)), jnp.array(True))):
+        np.testing.assert_array_equal(same.cov, before.cov)
+
+
+@pytest.mark.parametrize("far", [0.0, 0.2, 1.0])
+def test_ranges_that_agree_with_a_jump_do_not_contradict_it_and_those_of_the_expected_place_do(far):
+    assert not told((far, 0.0, 0.0), (far, 0.0, 0.0))
+    assert told((0.0, 0.0, 0.0), (far, 0.0, 0.0)) == (far > 0.5)  # 0.2 m is two sigma of three ranges
+
+
+def test_ranges_that_were_taken_on_the_way_to_a_jump_do_not_contradict_it():
+    """Half a second ago the robot was half way."""
+    assert not told((0.5, 0.0, 0.0), (1.0, 0.0, 0.0), dt=1.0, age=-0.5)
+
+
+def test_a_sure_match_fits_and_sees_enough():
+    sure = [bool(trust.is_sure(match(np.zeros(3), *fit))) for fit in [(0.85, 1.0), (0.5, 1.0), (0.85, 0.3)]]
+    assert sure == [True, False, False]
+    needed = [bool(trust.needs_jump(match(np.zeros(3), 0.85), jnp.array(fit))) for fit in (0.3, 0.8)]
+    assert needed == [True, False]
+
+
+def learnt(errors, needed=0.1, std=STD) -> np.ndarray:
+    """Standard deviations learnt from innovations (n, 3) where a spread of std was expected; those larger than
+    `needed` are what the scan needs."""
+    unrest, belief, at = CALM, expecting(), jnp.array(layout.pose_indices(NODES))
+    cov = belief.cov * (std / STD) ** 2
+    for error in errors:
+        belief = belief._replace(cov=cov.at[at, at].add(unrest[jnp.array([0, 0, 1])]))  # as it is predicted
+        unrest = learn_unrest(unrest, match(error), belief, jnp.array(np.abs(error).max() > needed))
+    return np.sqrt(np.asarray(unrest, float))
+
+
+def test_unrest_of_a_robot_that_jumps_is_learnt_and_forgotten():
+    """Every fifth scan comes 0.2 m and 0.2 rad off, the others as expected."""
+    rng = np.random.default_rng(0)
+    errors = STD * rng.normal(size=(400, 3))
+    np.testing.assert_allclose(learnt(errors), trust.CALM, rtol=1e-6)
+    errors[::5, [0, 2]] += 0.2
+    position, heading = learnt(errors)
+    # the mean of x and y: 0.2 / sqrt(2) in a fifth of the scans, running over 20 scans
+    np.testing.assert_allclose(position, 0.2 / np.sqrt(2) / np.sqrt(5), rtol=0.4)
+    np.testing.assert_allclose(heading, 0.2 / np.sqrt(5), rtol=0.4)
+    assert bool(trust.restless(jnp.array([position, heading]) ** 2))
+    assert not bool(trust.restless(CALM))
+
+
+def test_what_the_scan_does_not_need_or_was_expected_anyway_teaches_nothing():
+    errors = np.tile([0.2, 0.0, 0.2], (50, 1))
+    np.testing.assert_allclose(learnt(errors, needed=1.0), trust.CALM, rtol=1e-6)
+    np.testing.assert_allclose(learnt(errors, std=0.3), trust.CALM, rtol=1e-6)
+    assert learnt(errors).min() > 0.1

@@ -1,0 +1,152 @@
+"""What a match is worth: how surprising it is, whether a jump of the robot explains it, and its fusion.
+
+A match is weighed against what was expected of it. Where a scan that is sure of itself contradicts the expectation,
+the robot's motion was not what its velocity said: stamps that come late, a bump, a turn between two scans. Then the
+pose gets uncertain enough to follow, unless the ranges speak against it. How often that happens is learnt.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from uwbslam_jax import layout, ranging
+from uwbslam_jax.config import Params
+from uwbslam_jax.ekf import Gaussian, update_information
+from uwbslam_jax.geometry import wrap_angle
+from uwbslam_jax.matching import Match
+from uwbslam_jax.measurements import Frame
+
+SURPRISE = 30.0
+"""Squared Mahalanobis distance of a match beyond which it is not believed (chi-square, 3: 1e-6)."""
+CALM = (0.002, 0.001)
+"""Motion that no velocity explains, of a robot whose stamps are right: one standard deviation [m, rad]."""
+_RESTLESS = (0.05, 0.03)
+"""A robot moves by jumps when this much of its motion is unexplained [m, rad]."""
+_UNREST_SCALE = (0.3, 0.5)
+"""Most that is learnt, and the expected spread from which on a match says little about jumps [m, rad]."""
+_UNREST_RATE = 0.05
+"""Share of one match in what is learnt."""
+_MATCH_FLOOR = (0.004, 0.004, 0.0006)
+"""Error of any match beyond what its Hessian tells: cells, drawn walls [m, m, rad]."""
+_SURE = (0.65, 0.5)
+"""A match is sure of itself with such a score and share of returns on observed cells."""
+_NEEDED = 0.15
+"""A jump is needed where the scan fits the expected pose so much worse than the match [score x share known]."""
+_UNEXPECTED = 9.0
+"""Squared innovation over its expectation from which on it is taken for a jump."""
+_JUMP = (0.5, 1.0)
+"""Largest standard deviation that a jump is given [m, rad]."""
+_CONTRADICTION = 6.0
+"""How much worse the ranges may fit a jump than what was expected (difference of robust squares)."""
+_SHORTEST_S = 0.05
+"""A jump is taken to have lasted at least so long [s]."""
+
+
+def expected_match(belief: Gaussian) -> Float[Array, "3"]:
+    """The pose that a match is expected to report: robot pose + map error [m, m, rad]."""
+    return layout.matched_pose_jacobian(layout.node_count(belief.mean.shape[0])) @ belief.mean
+
+
+def restless(unrest: Float[Array, "2"]) -> Bool[Array, ""]:
+    """Whether the robot moves by jumps. unrest: variances [m^2, rad^2]."""
+    return jnp.any(unrest > jnp.array(_RESTLESS) ** 2)
+
+
+def is_sure(match: Match) -> Bool[Array, ""]:
+    """Whether a match is sure of itself by its score and by what it sees of the map."""
+    return (match.score > _SURE[0]) & (match.known > _SURE[1])
+
+
+def needs_jump(match: Match, expected_fit: Float[Array, ""]) -> Bool[Array, ""]:
+    """Whether the scan fits the expected pose clearly worse. expected_fit: score x known there."""
+    return expected_fit < match.score * match.known - _NEEDED
+
+
+def weigh(
+    match: Match, belief: Gaussian, params: Params, beams: Int[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, "3 3"]]:
+    """How surprising a match is, and its information about pose + map error.
+
+    The information is its Hessian, for as many of its beams as count as independent, and never better than the floor
+    (Y^-1 + floor)^-1. The surprise is the squared Mahalanobis distance to what was expected; information falls with
+    it as with a range's (Geman-McClure), so that a plausible match of the wrong place cannot drag the state.
+    """
+    share = params.independent_beams / jnp.maximum(beams, params.independent_beams)
+    Y = match.information * (share / params.sigma_l**2)
+    floor = jnp.diag(jnp.array(_MATCH_FLOOR) ** 2)
+    Y = jnp.linalg.solve(jnp.eye(3) + Y @ floor, Y)
+    innovation, S = _innovation(match, belief)
+    # nu^T (S + Y^-1)^-1 nu without the inverse of a Y that may be singular
+    surprise = innovation @ jnp.linalg.solve(jnp.eye(3) + Y @ S, Y @ innovation)
+    return surprise, Y / (1.0 + surprise / SURPRISE) ** 2
+
+
+def fuse(belief: Gaussian, match: Match, information: Float[Array, "3 3"]) -> Gaussian:
+    """EKF update by a matched pose, of which the map's own error is a part (match hard, fuse soft; DESIGN 1.9)."""
+    C = layout.matched_pose_jacobian(layout.node_count(belief.mean.shape[0]))
+    innovation, _ = _innovation(match, belief)
+    return update_information(belief, C.T @ information @ C, C.T @ (information @ innovation))
+
+
+def learn_unrest(
+    unrest: Float[Array, "2"], match: Match, belief: Gaussian, needed: Bool[Array, ""]
+) -> Float[Array, "2"]:
+    """Variance of the motion between two scans that no velocity explains, after one more match [m^2, rad^2].
+
+    A running mean of what the innovation has beyond its expectation. Where much was expected anyway, a match says
+    little; where the scan fits the expected pose too, a difference is the match's own and not the robot's.
+    """
+    square, expected = _excess(match, belief)
+    square = jnp.where(needed, square, jnp.minimum(square, expected))
+    scale = jnp.array(_UNREST_SCALE) ** 2
+    move = _UNREST_RATE * scale / (scale + expected) * (jnp.minimum(square, 4 * scale) - expected)
+    return jnp.clip(unrest + move, jnp.array(CALM) ** 2, scale)
+
+
+def contradicted(
+    match: Match, belief: Gaussian, frame: Frame, usable: Bool[Array, "M"], params: Params
+) -> Bool[Array, ""]:
+    """Whether the frame's ranges speak for the expected pose and against the matched one.
+
+    Most were taken on the way there, so the jump is taken to have been driven since the last frame.
+    """
+    ranges = frame.ranges
+    innovation, _ = _innovation(match, belief)
+    k = layout.node_count(belief.mean.shape[0])
+    pose, velocity = jnp.array(layout.pose_indices(k)), jnp.array([2 * k, 2 * k + 1])
+    robots = usable & ((ranges.i == 0) | (ranges.j == 0))
+
+    def misfit(vector):
+        z = (ranges.range - ranging.predicted_ranges(vector, ranges, params)) / (2 * params.sigma_n)
+        return jnp.sum(jnp.where(robots, z**2 / (1 + z**2 / 9.0), 0.0))
+
+    driven = innovation[:2] / jnp.maximum(frame.dt, _SHORTEST_S)
+    return misfit(belief.mean.at[pose].add(innovation).at[velocity].add(driven)) > misfit(belief.mean) + _CONTRADICTION
+
+
+def allow_jump(belief: Gaussian, match: Match, credible: Bool[Array, ""]) -> Gaussian:
+    """The belief, where a match is unexpected and credible made uncertain enough to follow it. Only the pose: a jump
+    tells nothing about the velocity."""
+    square, expected = _excess(match, belief)
+    jumped = credible & jnp.any(square > _UNEXPECTED * expected)
+    wider = jnp.minimum(jnp.maximum(square - expected, 0.0), jnp.array(_JUMP) ** 2)
+    at = jnp.array(layout.pose_indices(layout.node_count(belief.mean.shape[0])))
+    wider = jnp.where(jumped, wider, 0.0)[jnp.array([0, 0, 1])]
+    return belief._replace(cov=belief.cov.at[at, at].add(wider))
+
+
+def _innovation(match: Match, belief: Gaussian) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
+    """How far a match is from what was expected, as far as the scan can tell, and the covariance of what was."""
+    C = layout.matched_pose_jacobian(layout.node_count(belief.mean.shape[0]))
+    innovation = match.pose - C @ belief.mean
+    seen = match.informed @ innovation[:2]
+    return jnp.append(seen, wrap_angle(innovation[2])), C @ belief.cov @ C.T
+
+
+def _excess(match: Match, belief: Gaussian) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
+    """Squared innovation, position (mean of x and y) and heading, and what was expected of it [m^2, rad^2]."""
+    innovation, S = _innovation(match, belief)
+    square, expected = innovation**2, jnp.diagonal(S) + jnp.array(_MATCH_FLOOR) ** 2
+    mean = jnp.array([[0.5, 0.5, 0.0], [0.0, 0.0, 1.0]])
+    return mean @ square, mean @ expected
