@@ -24,7 +24,7 @@ FLOORS: dict[float, str] = {
     4.1: "paper trust",
     5: "slam",
     5.1: "beacon_state",
-    6: "startup beacons",
+    6: "startup beacons calibration",
     6.1: "history",
     6.2: "session",
     6.3: "findings",

@@ -47,6 +47,12 @@ _FOUND_SHARE = 0.7
 """When the robot's ranges to so many of the beacons stop fitting at once, and one other place explains so many of
 them, it is the robot that was carried. The filter may have settled where two or three of them fit by chance."""
 _CARRIED_S = 0.5
+_CARRIED_M = 0.5
+"""A robot that was carried less far finds itself by its scans."""
+_FITTING_SCORE = 0.7
+_CONTRADICTED_S = 3.0
+"""Where the scans fit, the ranges must speak against them for so long: ranges through walls and biases do so at times,
+but not from one other place for long."""
 _NEWEST = 4
 """So many of a beacon's newest ranges place a robot that was carried."""
 
@@ -73,6 +79,7 @@ class BeaconKeeper:
         self._sigma_n = settings.uwb.sigma_n
         self._lives: dict[int, _Life] = {}
         self._start: int | None = None
+        self._contradicted: float | None = None  # since when another place explains the robot's ranges [s]
 
     def status(self, slot: int) -> str:
         """static, moving, silent, dropped or waiting."""
@@ -98,7 +105,8 @@ class BeaconKeeper:
         span = self._seconds(pending[-1][0].stamp) - self._seconds(pending[0][0].stamp)
         now = self._seconds(pending[-1][0].stamp)
         share, found = self._find_carried_robot(state, self._known(state, now, 0))
-        if found is not None:
+        believed = self._believes(found, now, [e for frame, e in pending if frame.frame.has_scan])
+        if found is not None and believed:
             for life in self._lives.values():
                 life.sightings.forget(other=0)
             return beacon_state.put_robot(state, found), [(0, "was carried: found again by its ranges")]
@@ -223,6 +231,20 @@ class BeaconKeeper:
             events.append((slot, f"ranges do not fit ({verdict.bias:+.1f} m): a clock, walls, or it was moved"))
         return state
 
+    def _believes(self, found: np.ndarray | None, now: float, seen: list[Estimate]) -> bool:
+        """Whether the robot is believed to have been carried to another place that its ranges found: at once where the
+        scans do not fit the map either."""
+        if found is None:
+            self._contradicted = None
+            return False
+        self._contradicted = now if self._contradicted is None else self._contradicted
+        scores = [estimate.score for estimate in seen if not estimate.poor]
+        fitting = len(scores) > 0 and float(np.median(scores)) > _FITTING_SCORE
+        if fitting and now - self._contradicted < _CONTRADICTED_S:
+            return False
+        self._contradicted = None
+        return True
+
     def _find_carried_robot(self, state: State, known: Known) -> tuple[float, np.ndarray | None]:
         """Share of the resting beacons that the robot's ranges do not fit, and where the robot is by its ranges alone
         when they say that it is not where the state has it."""
@@ -233,7 +255,7 @@ class BeaconKeeper:
                 continue
             recent = life.sightings.since(known.now - _CARRIED_S)
             recent = recent[recent[:, OTHER] == 0]
-            if len(recent) < 2 or known.noise[slot] > self._sigma_n:
+            if len(recent) < 2:
                 continue
             misfit.append(float(np.median(np.abs(recent[:, NORMALISED]))) > _MISFIT)
             rows.append(
@@ -245,7 +267,7 @@ class BeaconKeeper:
         anchors, distance = np.concatenate(rows)[:, :2], np.concatenate(rows)[:, 2]
         # the newest ranges were taken on the move: a few decimetres are as good as they get
         found = locate(anchors, distance, np.full(len(distance), 2 * self._sigma_n))
-        if found is None:
+        if found is None or np.linalg.norm(found[0] - known.places[0]) < _CARRIED_M:
             return share, None
         left = np.abs(np.linalg.norm(anchors - found[0], axis=1) - distance)
         return share, found[0] if np.mean(left < _MISFIT * self._sigma_n) > _FOUND_SHARE else None

@@ -55,6 +55,7 @@ def to_result(session: Session, facts: Facts) -> Result:
     at = np.flatnonzero(history.has_scan) if scans or not facts.odometry_used else np.arange(len(history.stamps))
     told = [] if scans else [_NO_SCAN if facts.odometry_used else _NO_TRACK]
     told += [] if facts.relative is None else [_RELATIVE]
+    told += _biases(session)
     facts = dataclasses.replace(facts, warnings=[*facts.warnings, *told])
     stamps = np.array(history.stamps, np.int64)[at]
     start = int(stamps[0]) if len(stamps) else 0
@@ -78,6 +79,16 @@ def to_result(session: Session, facts: Facts) -> Result:
         diagnostics=diagnostics,
         events=list(history.events),
         summary=_summary(session, facts),
+    )
+
+
+def _biases(session: Session) -> list[str]:
+    """A warning where biases were found that nobody configured."""
+    ids = {slot: node for node, slot in session.slots.items()}
+    found = {ids[slot]: bias for slot, bias in session.found_bias.items()}
+    told = ", ".join(f"node {node} {bias:+.2f} m" for node, bias in sorted(found.items()))
+    return (
+        [f"ranges are biased: {told} were solved from the run; set uwb.bias if the radios are known"] if found else []
     )
 
 
@@ -157,6 +168,7 @@ def _summary(session: Session, facts: Facts) -> dict[str, Any]:
     The real-time factor is the recording's duration over the time taken, compilation left out.
     """
     history = session.history
+    ids = {slot: node for node, slot in session.slots.items()}
     stamps, step_ms = history.stamps, facts.step_ms
     duration = (stamps[-1] - stamps[0]) / 1e9 if stamps else 0.0
     decided = None if session.decided_at is None else (session.decided_at - stamps[0]) / 1e9
@@ -184,6 +196,7 @@ def _summary(session: Session, facts: Facts) -> dict[str, Any]:
         "searches": total.get("searched", 0),
         "ranges_used": used,
         "ranges_rejected": rejected,
+        "found_bias": {str(ids[slot]): bias for slot, bias in sorted(session.found_bias.items())},
         "dropped": dict(sorted(facts.dropped.items())),
         "truncated": facts.truncated,
         "warnings": facts.warnings,

@@ -118,6 +118,25 @@ def seen(blind: Blind, heading: Float[Array, ""]) -> Float[Array, "2 2"]:
     return jnp.eye(2) - blind.weight * e[:, None] * e[None, :]
 
 
+def share_of_walls(
+    surface: Surface, some: Bool[Array, "B"], counted: Bool[Array, "B"], heading: Float[Array, ""]
+) -> Float[Array, "2 2"]:
+    """By how much each direction of a matched position is told by some of a scan's walls: G_all^-1 G_some of their
+    normals, in the frame of a heading. A match then is (1 - share) what the other walls say + share what these say.
+
+    Args:
+      some: beams on the walls asked about, a part of those `counted`.
+    """
+
+    def gram(beams):
+        normal = jnp.where((beams & surface.found)[:, None], surface.tangent, 0.0)[:, ::-1] * jnp.array([1.0, -1.0])
+        return normal.T @ normal
+
+    R = rotation(heading)
+    few = _BLIND[0] * jnp.maximum(jnp.sum(counted), 1)
+    return R @ jnp.linalg.solve(gram(counted) + few * jnp.eye(2), gram(some & counted)) @ R.T
+
+
 class _LidarAndPrior(NamedTuple):
     """What the residual of a match needs, at one level."""
 

@@ -17,8 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from uwbslam_jax import slam, startup
+from uwbslam_jax import beacon_state, layout, ranging, slam, startup
 from uwbslam_jax.beacons import BeaconKeeper
+from uwbslam_jax.calibration import Calibration
 from uwbslam_jax.config import Params, Settings, make_config, make_params
 from uwbslam_jax.history import History
 from uwbslam_jax.keyframes import Buffer
@@ -30,6 +31,11 @@ CONTROL_EVERY = 10
 """Frames between two looks of the host."""
 _SOLVE_EVERY_S = 1.0
 """The start-up problem is solved at most this often, in the log's time."""
+
+_CALIBRATE_EVERY_S = 5.0
+"""Biases are looked for this often, in the log's time."""
+_NEWS_M = 0.02
+"""Biases or beacons that differ by less from what is known are no news."""
 
 TRACES: Counter[str] = Counter()
 """How often each compiled function was traced, by name; a test counts them."""
@@ -63,7 +69,7 @@ class Session:
       state: the estimator's.
       decided_at: stamp of the frame at which the published frame was decided, None before [ns].
       status: of the start-up, in words.
-      found_bias: slot -> range bias that start-up found beyond the configured one [m]; empty where there is none.
+      found_bias: slot -> range bias that was found beyond the configured one [m]; empty where there is none.
       history: what was reported so far.
     """
 
@@ -84,6 +90,8 @@ class Session:
         self._solved_at = self._solved_with = 0
         self._buffer = self._new_buffer()
         self._keeper = BeaconKeeper(settings)
+        self._calibration = Calibration(settings.uwb.sigma_n)
+        self._calibrated_at = 0
 
     @property
     def slots(self) -> dict[int, int]:
@@ -127,7 +135,7 @@ class Session:
             self._buffer.height, self._buffer.bias = np.asarray(self.params.height), np.asarray(self.params.bias)
 
     def _biased(self, params: Params) -> Params:
-        """Parameters with the biases that start-up found added to the configured ones."""
+        """Parameters with the biases that were found added to the configured ones."""
         bias = np.array(params.bias)
         for slot, found in self.found_bias.items():
             bias[slot] += found
@@ -174,9 +182,9 @@ class Session:
         if outcome.biased:
             nodes = [0, *outcome.placement.slots]
             self.found_bias = dict(zip(nodes, map(float, outcome.placement.bias), strict=True))
-            self.params = self._biased(self.params)
+            self.params = self._biased(make_params(self.settings, self._slots))
         adopted = startup.adopt(self.config, self.params, self.state, self._buffer, outcome.placement, (origin, along))
-        self.state, self.decided_at = adopted.state, now
+        self.state, self.decided_at, self._calibrated_at = adopted.state, now, now
         self.config = make_config(self.settings)
         self.tiles.clear()
         self.history.republish(adopted)
@@ -192,6 +200,33 @@ class Session:
         for slot, text in events:
             who = "robot" if slot == 0 else f"beacon {ids[slot]}"
             self.history.event(pending[-1][0].stamp, f"{who} {text}")
+            if slot > 0:
+                self._calibration.forget(slot)
+        loudness = np.asarray(ranging.loudness(self.state.scatter.log))
+        for frame, estimate in pending:
+            self._calibration.hear(frame, estimate, self.params, loudness)
+        now = pending[-1][0].stamp
+        if now - self._calibrated_at > _CALIBRATE_EVERY_S * 1e9:
+            self._calibrated_at = now
+            self._calibrate(now)
+
+    def _calibrate(self, now: int) -> None:
+        """Take over biases where the run has told them, and the beacons that go with them."""
+        configured = make_params(self.settings, self._slots)
+        places = np.asarray(layout.unpack(self.state.belief.mean).positions, float)
+        solution = self._calibration.solve(places, self.found_bias, configured)
+        if solution is None or not solution.known or not (self.found_bias or solution.significant):
+            return
+        nodes = [0, *solution.slots]
+        before = np.array([self.found_bias.get(slot, 0.0) for slot in nodes])
+        news = max(np.abs(solution.bias - before).max(), np.abs(solution.beacons - places[solution.slots]).max())
+        if news < _NEWS_M:
+            return
+        if not self.found_bias:
+            self.history.event(now, "ranges are biased: biases and beacons solved from the run so far")
+        self.found_bias |= dict(zip(nodes, map(float, solution.bias), strict=True))
+        self.params = self._biased(configured)
+        self.state = beacon_state.put_beacons(self.state, solution.slots, solution.beacons, solution.cov)
 
     def beacon_status(self, slot: int) -> str:
         """static, moving, silent, dropped or waiting."""

@@ -18,7 +18,7 @@ from uwbslam_jax import grid as occupancy
 from uwbslam_jax import layout, matching, motion, paper, ranging, trust
 from uwbslam_jax.config import Config, Params
 from uwbslam_jax.ekf import Gaussian
-from uwbslam_jax.geometry import rotation, transform_points, wrap_angle
+from uwbslam_jax.geometry import rotation, safe_norm, transform_points, wrap_angle
 from uwbslam_jax.grid import Grid, Sweep
 from uwbslam_jax.matching import Match
 from uwbslam_jax.measurements import Frame, Scan
@@ -42,7 +42,7 @@ _DRAW_FIRST = 10
 """The first scans are all drawn: there is no map yet to be blurred."""
 _NEW_GROUND = 0.02
 """Share of new ground in a scan from which on it is drawn where the ranges say, not where the old map says."""
-_DRAW_PULL = (0.015, 0.0026)
+_DRAW_PULL = (0.015, 0.0005)
 """New ground is drawn at most this far from the match towards the fused pose [m, rad]."""
 
 
@@ -58,7 +58,7 @@ class State(NamedTuple):
       grid: the map's window.
       drawn_pose: (3,) where the last scan was drawn.
       scans_drawn: how many were.
-      novelty: share of the last drawn scan that fell on new ground.
+      map_spread: of the map's errors from place to place, see trust.MapSpread.
       unrest: variance of the motion between two scans that no velocity explains, see trust.learn_unrest [m^2, rad^2].
     """
 
@@ -70,7 +70,7 @@ class State(NamedTuple):
     grid: Grid
     drawn_pose: Float[Array, "3"]
     scans_drawn: Int[Array, ""]
-    novelty: Float[Array, ""]
+    map_spread: trust.MapSpread
     unrest: Float[Array, "2"]
 
 
@@ -128,7 +128,7 @@ def init(config: Config) -> State:
         grid=occupancy.empty(config.cells, config.levels, config.resolution),
         drawn_pose=jnp.zeros(3, jnp.float32),
         scans_drawn=jnp.zeros((), jnp.int32),
-        novelty=jnp.zeros((), jnp.float32),
+        map_spread=trust.even_map(),
         unrest=jnp.array(trust.CALM, jnp.float32) ** 2,
     )
 
@@ -149,14 +149,15 @@ def step(config: Config, params: Params, state: State, frame: Frame) -> tuple[St
     sweep = undo_motion(frame.scan, params.lidar, rotation(-s.heading) @ s.velocities[0], s.yaw_rate)
     align = _joint_match if config.preset == "paper" else _match_and_fuse
     belief, matched = align(config, params, state, belief, frame, sweep, usable)
-    state, drawn = _draw(config, state._replace(belief=belief, unrest=matched.unrest), matched, sweep)
+    state, drawn = _draw(config, params, state._replace(belief=belief, unrest=matched.unrest), matched, sweep)
     return state, _report(state, matched, used, drawn)
 
 
 def _predict(config, params, state, frame) -> Gaussian:
     if config.preset == "paper":
         return paper.predict(state.belief, params, frame.dt)
-    return motion.predict(state.belief, params, frame.dt, frame.odometry, state.moving, state.novelty, state.unrest)
+    spread = state.map_spread.apart, state.map_spread.rate
+    return motion.predict(state.belief, params, frame.dt, frame.odometry, state.moving, spread, state.unrest)
 
 
 def _usable(config, state, frame) -> Bool[Array, "M"]:
@@ -265,32 +266,41 @@ def _match(config, params, state, belief, sweep, has_scan) -> tuple[Match, Bool[
     return lax.cond(wanted, wide, lambda _: match, None), wanted
 
 
-def _draw(config, state, matched: _Matched, sweep) -> tuple[State, Bool[Array, ""]]:
-    """The map with the scan drawn, when it may be and the robot has moved or turned since the last one."""
+def _draw(config, params, state, matched: _Matched, sweep) -> tuple[State, Bool[Array, ""]]:
+    """The map with the scan drawn, when it may be and the robot has moved or turned since the last one.
+
+    New ground is drawn at a known place, so what the map errs by there is known to be the pose's own error.
+    """
     pose = matched.match.pose
     moved = jnp.hypot(*(pose[:2] - state.drawn_pose[:2])) > _DRAW_MOVED[0]
     turned = jnp.abs(wrap_angle(pose[2] - state.drawn_pose[2])) > _DRAW_MOVED[1]
     wanted = matched.trusted & (moved | turned | (state.scans_drawn < _DRAW_FIRST))
-    novelty = _novelty(config, state.grid, sweep, pose)
+    new = _on_new_ground(config, state.grid, sweep, pose)
+    novelty = jnp.sum(new) / jnp.maximum(jnp.sum(sweep.valid), 1)
     limit = jnp.array([_DRAW_PULL[0], _DRAW_PULL[0], _DRAW_PULL[1]])
     pull = jnp.clip(layout.unpack(state.belief.mean).map_error, -limit, limit)
     at = pose - jnp.minimum(1.0, novelty / _NEW_GROUND) * pull
     grid = lax.cond(wanted, lambda g: occupancy.integrate(g, at, sweep, config.resolution), lambda g: g, state.grid)
+    share = jnp.zeros((3, 3)).at[2, 2].set(novelty)
+    share = share.at[:2, :2].set(matching.share_of_walls(matching.surface(sweep), new, sweep.valid, pose[2]))
+    share = jnp.where(wanted & (state.scans_drawn > 0), share, 0.0)
+    exploring = wanted & (novelty > _NEW_GROUND)
+    way = jnp.where(exploring, safe_norm(pose[:2] - state.drawn_pose[:2]), 0.0)
     state = state._replace(
+        belief=trust.anchor(state.belief, at, share, params),
+        map_spread=trust.learn_spread(state.map_spread, state.belief, share, way, params),
         grid=grid,
         drawn_pose=jnp.where(wanted, pose, state.drawn_pose),
         scans_drawn=state.scans_drawn + wanted,
-        novelty=jnp.where(wanted & (state.scans_drawn > 0), novelty, 0.0),
     )
     return state, wanted
 
 
-def _novelty(config, grid, sweep, pose):
-    """Share of the returns that end where the coarsest level has no wall yet in any of the four cells around."""
+def _on_new_ground(config, grid, sweep, pose):
+    """Which returns end where the coarsest level has no wall yet in any of the four cells around."""
     ends = transform_points(pose, sweep.points)
     on_wall, inside = matching.on_known_wall(grid, ends, config.resolution, len(grid.levels) - 1)
-    new = sweep.valid & inside & ~on_wall
-    return jnp.sum(new) / jnp.maximum(jnp.sum(sweep.valid), 1)
+    return sweep.valid & inside & ~on_wall
 
 
 def _report(state, matched: _Matched, used, drawn) -> Estimate:

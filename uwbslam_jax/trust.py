@@ -7,13 +7,15 @@ pose gets uncertain enough to follow, unless the ranges speak against it. How of
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from uwbslam_jax import layout, ranging
 from uwbslam_jax.config import Params
 from uwbslam_jax.ekf import Gaussian, update_information
-from uwbslam_jax.geometry import wrap_angle
+from uwbslam_jax.geometry import safe_norm, wrap_angle
 from uwbslam_jax.matching import Match
 from uwbslam_jax.measurements import Frame
 
@@ -41,6 +43,32 @@ _CONTRADICTION = 6.0
 """How much worse the ranges may fit a jump than what was expected (difference of robust squares)."""
 _SHORTEST_S = 0.05
 """A jump is taken to have lasted at least so long [s]."""
+
+
+class MapSpread(NamedTuple):
+    """What is known of how the map errs from place to place, learnt while it was drawn.
+
+    Attributes:
+      apart: (3, 3) mean covariance of a match where new ground was drawn: how much neighbouring ground may differ.
+      views: how much new ground that is, in views.
+      drift: (3, 3) what drawing new ground added to the map error so far [m, m, rad].
+      way: how far was driven on new ground [m].
+    """
+
+    apart: Float[Array, "3 3"]
+    views: Float[Array, ""]
+    drift: Float[Array, "3 3"]
+    way: Float[Array, ""]
+
+    @property
+    def rate(self) -> Float[Array, "3 3"]:
+        """Random walk of the map error with the way [1/m]."""
+        return self.drift / jnp.maximum(self.way, 1.0)
+
+
+def even_map() -> MapSpread:
+    """Of a map that nothing was drawn into yet."""
+    return MapSpread(jnp.zeros((3, 3)), jnp.zeros(()), jnp.zeros((3, 3)), jnp.zeros(()))
 
 
 def expected_match(belief: Gaussian) -> Float[Array, "3"]:
@@ -87,6 +115,48 @@ def fuse(belief: Gaussian, match: Match, information: Float[Array, "3 3"]) -> Ga
     C = layout.matched_pose_jacobian(layout.node_count(belief.mean.shape[0]))
     innovation, _ = _innovation(match, belief)
     return update_information(belief, C.T @ information @ C, C.T @ (information @ innovation))
+
+
+def anchor(belief: Gaussian, at: Float[Array, "3"], share: Float[Array, "3 3"], params: Params) -> Gaussian:
+    """The belief after a scan was drawn: e <- (1 - N) e + N (at - pose) + w, w as in `drawing_error`.
+
+    Where new ground is drawn the map errs by what the pose errs by, whatever it was before: the map error is carried
+    over with its covariance, so that ranges that later mend the pose mend what the map is taken for as well.
+
+    Args:
+      at: pose the scan was drawn at [m, m, rad]. share: N, of what it saw that is new ground.
+    """
+    k = layout.node_count(belief.mean.shape[0])
+    pose, error = jnp.array(layout.pose_indices(k)), jnp.array(layout.map_error_indices(k))
+    apart = at - belief.mean[pose]
+    apart = apart.at[2].set(wrap_angle(apart[2]))
+    mean = belief.mean.at[error].add(share @ (apart - belief.mean[error]))
+    F = jnp.eye(belief.mean.shape[0])
+    F = F.at[error[:, None], error].add(-share).at[error[:, None], pose].add(-share)
+    cov = F @ belief.cov @ F.T
+    return Gaussian(mean, cov.at[error[:, None], error].add(drawing_error(share, params)))
+
+
+def drawing_error(share: Float[Array, "3 3"], params: Params) -> Float[Array, "3 3"]:
+    """Covariance of what drawing new ground adds to the map error besides the pose's own: sigma_map for a whole view,
+    and as much for one that is drawn in many small parts."""
+    noise = share * jnp.stack([params.sigma_map, params.sigma_map, params.sigma_map_yaw])
+    return noise @ noise.T / jnp.maximum(safe_norm(share.ravel()), 1e-3)
+
+
+def learn_spread(
+    spread: MapSpread, belief: Gaussian, share: Float[Array, "3 3"], way: Float[Array, ""], params: Params
+) -> MapSpread:
+    """Spread of the map's errors after a scan was drawn with a share of new ground.
+
+    Args:
+      belief: before the scan was drawn. way: driven since the last scan on new ground [m].
+    """
+    C = layout.matched_pose_jacobian(layout.node_count(belief.mean.shape[0]))
+    new = jnp.mean(jnp.diagonal(share))
+    views = spread.views + new
+    apart = spread.apart + new / jnp.maximum(views, 1e-6) * (C @ belief.cov @ C.T - spread.apart)
+    return MapSpread(apart, views, spread.drift + drawing_error(share, params), spread.way + way)
 
 
 def learn_unrest(
