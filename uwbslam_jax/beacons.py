@@ -105,7 +105,7 @@ class BeaconKeeper:
         span = self._seconds(pending[-1][0].stamp) - self._seconds(pending[0][0].stamp)
         now = self._seconds(pending[-1][0].stamp)
         share, found = self._find_carried_robot(state, self._known(state, now, 0))
-        believed = self._believes(found, now, [e for frame, e in pending if frame.frame.has_scan])
+        believed = self._believes(found, share, now, [e for frame, e in pending if frame.frame.has_scan])
         if found is not None and believed:
             for life in self._lives.values():
                 life.sightings.forget(other=0)
@@ -231,15 +231,15 @@ class BeaconKeeper:
             events.append((slot, f"ranges do not fit ({verdict.bias:+.1f} m): a clock, walls, or it was moved"))
         return state
 
-    def _believes(self, found: np.ndarray | None, now: float, seen: list[Estimate]) -> bool:
+    def _believes(self, found: np.ndarray | None, share: float, now: float, seen: list[Estimate]) -> bool:
         """Whether the robot is believed to have been carried to another place that its ranges found: at once where the
-        scans do not fit the map either."""
-        if found is None:
+        scans do not fit the map either, else when most of the ranges say so for long."""
+        scores = [estimate.score for estimate in seen if not estimate.poor]
+        fitting = len(scores) > 0 and float(np.median(scores)) > _FITTING_SCORE
+        if found is None or (fitting and share <= _FOUND_SHARE):
             self._contradicted = None
             return False
         self._contradicted = now if self._contradicted is None else self._contradicted
-        scores = [estimate.score for estimate in seen if not estimate.poor]
-        fitting = len(scores) > 0 and float(np.median(scores)) > _FITTING_SCORE
         if fitting and now - self._contradicted < _CONTRADICTED_S:
             return False
         self._contradicted = None

@@ -16,7 +16,7 @@ import numpy as np
 from uwbslam_jax.config import Params
 from uwbslam_jax.measurements import StampedFrame
 from uwbslam_jax.multilateration import DECIDED, soften
-from uwbslam_jax.placement import CALIBRATED_M
+from uwbslam_jax.placement import CALIBRATED_M, largest_sigma
 from uwbslam_jax.slam import Estimate
 
 BIAS_M = 0.3
@@ -44,7 +44,8 @@ class Solution(NamedTuple):
       slots: of the beacons. beacons: (B, 2) [m]; bias, bias_sigma: (1 + B,) of the robot's node and theirs, in
         addition to what is configured [m].
       cov: (2 B, 2 B) of the beacons, biases marginalised.
-      gain: log-likelihood that the biases gain.
+      biased: whether biases explain the ranges far better than none.
+      gain: log-likelihood gained over what is known now.
     """
 
     slots: list[int]
@@ -52,17 +53,13 @@ class Solution(NamedTuple):
     bias: np.ndarray
     bias_sigma: np.ndarray
     cov: np.ndarray
+    biased: bool
     gain: float
-
-    @property
-    def significant(self) -> bool:
-        """Whether biases explain the ranges far better than none."""
-        return self.gain > DECIDED + 3.0 * len(self.bias)
 
     @property
     def known(self) -> bool:
         """Whether the ranges determine every one of them."""
-        return bool(np.all(self.bias_sigma < _KNOWN_M))
+        return bool(np.all(self.bias_sigma < _KNOWN_M) and largest_sigma(self.cov).max() < _KNOWN_M)
 
 
 @dataclass
@@ -112,7 +109,7 @@ class Calibration:
             _add(self._robot[j][key], at, distance, sigma)
 
     def solve(self, places: np.ndarray, found: dict[int, float], configured: Params) -> Solution | None:
-        """Beacons and biases, None where too little was ranged.
+        """Beacons, and biases where those explain the ranges far better than none; None where too little was ranged.
 
         Args:
           places: (K, 2) of the nodes to start from [m]. found: slot -> bias to start from [m].
@@ -124,11 +121,14 @@ class Calibration:
         problem = self._rows(slots, configured)
         bias = np.array([found.get(slot, 0.0) for slot in (0, *slots)])
         start = np.concatenate([places[slots].ravel(), bias])
-        _, without, _ = problem.minimise(start, CALIBRATED_M)
-        x, cost, cov = problem.minimise(start, BIAS_M)
+        calibrated = problem.minimise(start, CALIBRATED_M)
+        biased = problem.minimise(start, BIAS_M)
+        better = calibrated[1] - biased[1] > DECIDED + 3.0 * len(bias)
+        x, cost, cov = biased if better or found else calibrated
         m = 2 * len(slots)
         sigma = np.sqrt(np.diag(cov)[m:])
-        return Solution(slots, x[:m].reshape(-1, 2), x[m:], sigma, cov[:m, :m], without - cost)
+        gain = problem.cost(start, BIAS_M if found else CALIBRATED_M) - cost
+        return Solution(slots, x[:m].reshape(-1, 2), x[m:], sigma, cov[:m, :m], better, gain)
 
     def _rows(self, slots: list[int], configured: Params) -> _Problem:
         index = {slot: b for b, slot in enumerate(slots)}
@@ -172,8 +172,13 @@ class _Problem(NamedTuple):
         """
         x = self._coarser(_COARSE)._descend(x, bias_sigma)
         x = self._descend(x, bias_sigma)
-        J, r = self._linearise(x, bias_sigma)
-        return x, float(0.5 * r @ r), np.linalg.inv(J.T @ J + 1e-9 * np.eye(len(x)))
+        J, _ = self._linearise(x, bias_sigma)
+        return x, self.cost(x, bias_sigma), np.linalg.inv(J.T @ J + 1e-9 * np.eye(len(x)))
+
+    def cost(self, x: np.ndarray, bias_sigma: float) -> float:
+        """Negative log-likelihood of beacons and biases."""
+        _, r = self._linearise(x, bias_sigma)
+        return float(0.5 * r @ r)
 
     def _coarser(self, factor: float) -> _Problem:
         rows, pairs = self.rows.copy(), self.pairs.copy()

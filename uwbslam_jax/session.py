@@ -24,6 +24,7 @@ from uwbslam_jax.config import Params, Settings, make_config, make_params
 from uwbslam_jax.history import History
 from uwbslam_jax.keyframes import Buffer
 from uwbslam_jax.measurements import Frame, StampedFrame
+from uwbslam_jax.multilateration import DECIDED
 from uwbslam_jax.slam import Estimate, State
 from uwbslam_jax.tiles import Tiles
 
@@ -34,8 +35,6 @@ _SOLVE_EVERY_S = 1.0
 
 _CALIBRATE_EVERY_S = 5.0
 """Biases are looked for this often, in the log's time."""
-_NEWS_M = 0.02
-"""Biases or beacons that differ by less from what is known are no news."""
 
 TRACES: Counter[str] = Counter()
 """How often each compiled function was traced, by name; a test counts them."""
@@ -211,21 +210,19 @@ class Session:
             self._calibrate(now)
 
     def _calibrate(self, now: int) -> None:
-        """Take over biases where the run has told them, and the beacons that go with them."""
+        """Take over what the whole run tells of the beacons and their biases, where the state's contradict it."""
         configured = make_params(self.settings, self._slots)
         places = np.asarray(layout.unpack(self.state.belief.mean).positions, float)
         solution = self._calibration.solve(places, self.found_bias, configured)
-        if solution is None or not solution.known or not (self.found_bias or solution.significant):
+        if solution is None or not solution.known or solution.gain < DECIDED:
             return
-        nodes = [0, *solution.slots]
-        before = np.array([self.found_bias.get(slot, 0.0) for slot in nodes])
-        news = max(np.abs(solution.bias - before).max(), np.abs(solution.beacons - places[solution.slots]).max())
-        if news < _NEWS_M:
-            return
-        if not self.found_bias:
-            self.history.event(now, "ranges are biased: biases and beacons solved from the run so far")
-        self.found_bias |= dict(zip(nodes, map(float, solution.bias), strict=True))
-        self.params = self._biased(configured)
+        if solution.biased:
+            if not self.found_bias:
+                self.history.event(now, "ranges are biased: biases and beacons solved from the run so far")
+            self.found_bias |= dict(zip([0, *solution.slots], map(float, solution.bias), strict=True))
+            self.params = self._biased(configured)
+        else:
+            self.history.event(now, "beacons solved from the run so far")
         self.state = beacon_state.put_beacons(self.state, solution.slots, solution.beacons, solution.cov)
 
     def beacon_status(self, slot: int) -> str:

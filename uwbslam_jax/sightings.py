@@ -41,6 +41,8 @@ _SPEED_SIGMA = 0.1
 _SLOW = 0.02
 _RECENT_S = 1.0
 _CARRIED_SIGMA_M = 0.3
+_WALL_COST = 6.0
+"""Log-likelihood that it costs to say that a wall has come between two nodes."""
 _SUPPORTS = 0.5
 """Share of `DECIDED` by which an explanation must still win without the node that speaks for it the loudest."""
 
@@ -235,7 +237,9 @@ def judge(sightings: Sightings, known: Known, slot: int, velocity: np.ndarray) -
     spots = _moving_fits(rows, known, known.places[slot])
     best = [spot for spot in spots if spot.cost - spots[0].cost < DECIDED]
     spot = min(best, key=lambda s: float(np.linalg.norm(s.place - known.places[slot])))
-    moved = as_it_is - misfit(spot.place + time[:, None] * spot.velocity, at, distance, sigma)
+    moved = _unless_walled(as_it_is, off, rows) - misfit(
+        spot.place + time[:, None] * spot.velocity, at, distance, sigma
+    )
     several = len(np.unique(rows[:, OTHER])) > 1  # a second of ranges to one node leaves a motion open
     if several and _decides(moved, rows) and moved.sum() > biased.sum() + DECIDED:
         return Verdict(False, spot, rows, bias)
@@ -257,8 +261,20 @@ def resting_elsewhere(sightings: Sightings, known: Known, slot: int) -> tuple[Sp
     as_it_is = misfit(here, at, distance, sigma)
     bias = float(np.median(distance - np.linalg.norm(here - at, axis=1)))
     biased = as_it_is - misfit(here, at, distance - bias, sigma)
-    moved = as_it_is - misfit(spot.place, at, distance, sigma)
+    off = distance - np.linalg.norm(here - at, axis=1)
+    moved = _unless_walled(as_it_is, off, rows) - misfit(spot.place, at, distance, sigma)
     return found if _decides(moved, rows) and moved.sum() > biased.sum() + DECIDED else None
+
+
+def _unless_walled(cost: np.ndarray, off: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Costs (R,) of rows at a place, where those to one node that are too long by `off` (R,) [m] cost no more than
+    saying that a wall has come in between."""
+    cost = cost.copy()
+    for other in np.unique(rows[:, OTHER]):
+        mine = rows[:, OTHER] == other
+        if np.median(off[mine]) > 0:
+            cost[mine] *= min(1.0, _WALL_COST / max(float(cost[mine].sum()), 1e-9))
+    return cost
 
 
 def _decides(gain: np.ndarray, rows: np.ndarray) -> bool:
