@@ -211,8 +211,11 @@ class Buffer:
             ok = mine[np.abs(distance[mine] - middle) < _WILD_M]
             sigma = mean_sigma(len(ok), float(np.median(scatter[mine])), self.sigma_n)
             rows.append((share[ok].mean(), local[0][ok].mean(0), local[1][ok].mean(0), distance[ok].mean(), sigma))
-        columns = [np.array(column) for column in zip(*rows, strict=True)]
-        return Averages(groups // 2, np.full(len(groups), slot), *columns)
+        share, before, after, distance, sigma = (np.array(column) for column in zip(*rows, strict=True))
+        # a wall makes all of its ranges too long: many of them tell no more than one
+        walled = sigma > mean_sigma(1, self.sigma_n, self.sigma_n)
+        sigma = np.where(walled, sigma * np.sqrt(max(np.sum(walled), 1)), sigma)
+        return Averages(groups // 2, np.full(len(groups), slot), share, before, after, distance, sigma)
 
     def _scatter(self, distance: np.ndarray) -> np.ndarray:
         """(R,) standard deviation of a pair's ranges around each of them, from second differences: a model-free one,

@@ -292,5 +292,6 @@ def _averaged(rows: np.ndarray, known: Known, key: np.ndarray) -> tuple[np.ndarr
     # a median of n is as good as a mean of 0.64 n
     other = groups[:, OTHER].astype(int)
     variance = known.sigma_n**2 / np.maximum(0.64 * count, 1.0) + RANGE_FLOOR_M**2
-    # what makes a pair scatter more than its radios do does not average out
-    return groups, np.sqrt(variance + np.maximum(known.noise[other] ** 2 - known.sigma_n**2, 0.0))
+    # what makes a pair scatter more than its radios do does not average out, nor do many averages of it
+    excess = np.maximum(known.noise[other] ** 2 - known.sigma_n**2, 0.0)
+    return groups, np.sqrt(variance + excess * np.sum(other[:, None] == other, axis=1))
