@@ -187,9 +187,9 @@ class FilterSettings:
     """Standard deviation of one beam's residual 1 - Gamma."""
     independent_beams: float = 50.0
     """So many beams of a scan count as independent in a match's information, however many there are."""
-    sigma_map: float = 0.02
+    sigma_map: float = 0.05
     """What a scan of new ground adds to the map's own position error besides that of the pose it is drawn at [m]."""
-    sigma_map_yaw: float = 0.002
+    sigma_map_yaw: float = 0.008
     """The same for its heading [rad]."""
 
 

@@ -20,22 +20,34 @@ FREE = float(np.log(0.4 / 0.6))
 """Log-odds of one observation (HectorSLAM's update factors 0.9 and 0.4)."""
 CLAMP = (-2.5, 4.0)
 """Bounds of a cell, so that a door that closes is learnt within a few scans."""
+EPOCH_LEVEL = 4
 FREE_REACH_M = 12.8
 """Free space is carved this far from the sensor; returns are drawn as far as the window goes."""
 
 
 class Grid(NamedTuple):
-    """Log-odds of the pyramid's levels, finest first, each (cells, cells); 0 is unknown. origin: (2,) corner [m]."""
+    """The window.
+
+    Attributes:
+      levels: log-odds of the pyramid's levels, finest first, each (cells, cells); 0 is unknown.
+      origin: (2,) corner [m].
+      epochs: when each patch of ground was first drawn, in views of new ground drawn until then; 0 is never. Its cells
+        are resolution * 2^EPOCH_LEVEL.
+    """
 
     levels: tuple[Float[Array, "_ _"], ...]
     origin: Float[Array, "2"]
+    epochs: Float[Array, "_ _"]
 
 
 def empty(cells: int, levels: int, resolution: float) -> Grid:
     """A window without any observation, centred at (0, 0)."""
     half = cells * resolution / 2
+    coarse = cells >> EPOCH_LEVEL
     return Grid(
-        tuple(jnp.zeros((cells >> k, cells >> k), jnp.float32) for k in range(levels)), jnp.full(2, -half, jnp.float32)
+        tuple(jnp.zeros((cells >> k, cells >> k), jnp.float32) for k in range(levels)),
+        jnp.full(2, -half, jnp.float32),
+        jnp.zeros((coarse, coarse), jnp.float32),
     )
 
 
@@ -104,8 +116,26 @@ def _polar_tables(half: int, size: float) -> tuple[np.ndarray, np.ndarray]:
     return np.arctan2(y, x).astype(np.float32), np.hypot(x, y).astype(np.float32)
 
 
-def integrate(grid: Grid, pose: Float[Array, "3"], sweep: Sweep, resolution: float) -> Grid:
-    """The map after one scan seen from a pose: HIT where beams end, FREE where they pass, clamped.
+def epoch_seen(grid: Grid, ends: Float[Array, "B 2"], valid: Bool[Array, "B"], resolution: float) -> Float[Array, ""]:
+    """Mean epoch of the ground that beams end on, 0 where none of it was ever drawn."""
+    row, col, inside = _epoch_cells(grid, ends, valid, resolution)
+    epoch = jnp.where(inside, grid.epochs[row, col], 0.0)
+    return jnp.sum(epoch) / jnp.maximum(jnp.sum(epoch > 0), 1)
+
+
+def _epoch_cells(grid, ends, valid, resolution):
+    cells = grid.epochs.shape[0]
+    cell = jnp.floor((ends - grid.origin[None]) / (resolution * 2**EPOCH_LEVEL)).astype(jnp.int32)
+    inside = valid & jnp.all((cell >= 0) & (cell < cells), axis=-1)
+    cell = jnp.clip(cell, 0, cells - 1)
+    return cell[:, 1], cell[:, 0], inside
+
+
+def integrate(
+    grid: Grid, pose: Float[Array, "3"], sweep: Sweep, resolution: float, epoch: float | Float[Array, ""] = 1.0
+) -> Grid:
+    """The map after one scan seen from a pose: HIT where beams end, FREE where they pass, clamped; ground that was
+    never drawn gets the epoch.
 
     A cell is free when the two beams on either side of its bearing both pass it: a wall seen at grazing incidence
     is not eaten by its neighbour. A cell that is hit is not freed by the same scan.
@@ -122,7 +152,11 @@ def integrate(grid: Grid, pose: Float[Array, "3"], sweep: Sweep, resolution: flo
     for k, level in enumerate(grid.levels):
         size = resolution * 2**k
         levels.append(_integrate_level(level, grid.origin, size, ends, sensor, yaw, sweep))
-    return Grid(tuple(levels), grid.origin)
+    row, col, inside = _epoch_cells(grid, ends, sweep.valid, resolution)
+    before = grid.epochs[row, col]
+    first = jnp.where(before > 0, before, epoch)
+    epochs = grid.epochs.at[jnp.where(inside, row, grid.epochs.shape[0]), col].set(first, mode="drop")
+    return Grid(tuple(levels), grid.origin, epochs)
 
 
 def _integrate_level(level, origin, size, ends, sensor, yaw, sweep):

@@ -22,10 +22,6 @@ _FASTEST = (1.5, 2.0, 2.0)
 [m/s, rad/s, rad]."""
 
 
-_MAP_LENGTH_M = 5.0
-"""Ground this far apart was drawn with errors of its own [m]."""
-
-
 def transition(
     vector: Float[Array, "n"], dt: Float[Array, ""], odometry: Odometry, moving: Bool[Array, "K"]
 ) -> Float[Array, "n"]:
@@ -104,15 +100,12 @@ def predict(
     dt: Float[Array, ""],
     odometry: Odometry,
     moving: Bool[Array, "K"],
-    map_spread: tuple[Float[Array, "3 3"], Float[Array, "3 3"]],
     unrest: Float[Array, "2"],
 ) -> ekf.Gaussian:
     """Belief dt [s] later.
 
     Args:
       moving: (K,) which nodes are carried; the robot's entry is ignored.
-      map_spread: how the map's error changes from place to place, because the robot comes to ground that was drawn at
-        another time: the covariance to which it falls back with the way (Gauss-Markov), and a random walk [1/m].
       unrest: variance of a displacement and of a turn between two frames that no velocity explains [m^2, rad^2].
     """
     k = moving.shape[0]
@@ -123,11 +116,7 @@ def predict(
     jump = jnp.where(odometry.valid, 0.0, unrest)
     diagonal = diagonal.at[pose].add(jump[jnp.array([0, 0, 1])])
     rows = jnp.array(layout.map_error_indices(k))
-    way = safe_norm(mean[:2] - belief.mean[:2])
-    keep = jnp.exp(-way / _MAP_LENGTH_M)
-    mean, F = mean.at[rows].multiply(keep), F.at[rows].multiply(keep)
-    diagonal = diagonal.at[rows].add(1e-12)
-    Q = jnp.diag(diagonal).at[rows[:, None], rows].add((1.0 - keep**2) * map_spread[0] + way * map_spread[1])
+    Q = jnp.diag(diagonal.at[rows].add(1e-12))
     at = jnp.concatenate([jnp.arange(2 * k), jnp.array([4 * k])])
     to = jnp.concatenate([jnp.arange(2 * k, 4 * k), jnp.array([4 * k + 1])])
     Q = Q.at[at, to].add(coupling[at]).at[to, at].add(coupling[at])

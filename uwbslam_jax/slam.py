@@ -18,7 +18,7 @@ from uwbslam_jax import grid as occupancy
 from uwbslam_jax import layout, matching, motion, paper, ranging, trust
 from uwbslam_jax.config import Config, Params
 from uwbslam_jax.ekf import Gaussian
-from uwbslam_jax.geometry import rotation, safe_norm, transform_points, wrap_angle
+from uwbslam_jax.geometry import rotation, transform_points, wrap_angle
 from uwbslam_jax.grid import Grid, Sweep
 from uwbslam_jax.matching import Match
 from uwbslam_jax.measurements import Frame, Scan
@@ -149,15 +149,15 @@ def step(config: Config, params: Params, state: State, frame: Frame) -> tuple[St
     sweep = undo_motion(frame.scan, params.lidar, rotation(-s.heading) @ s.velocities[0], s.yaw_rate)
     align = _joint_match if config.preset == "paper" else _match_and_fuse
     belief, matched = align(config, params, state, belief, frame, sweep, usable)
-    state, drawn = _draw(config, params, state._replace(belief=belief, unrest=matched.unrest), matched, sweep)
+    state = state._replace(belief=belief, unrest=matched.unrest, map_spread=matched.map_spread)
+    state, drawn = _draw(config, params, state, matched, sweep)
     return state, _report(state, matched, used, drawn)
 
 
 def _predict(config, params, state, frame) -> Gaussian:
     if config.preset == "paper":
         return paper.predict(state.belief, params, frame.dt)
-    spread = state.map_spread.apart, state.map_spread.rate
-    return motion.predict(state.belief, params, frame.dt, frame.odometry, state.moving, spread, state.unrest)
+    return motion.predict(state.belief, params, frame.dt, frame.odometry, state.moving, state.unrest)
 
 
 def _usable(config, state, frame) -> Bool[Array, "M"]:
@@ -175,11 +175,14 @@ class _Matched(NamedTuple):
     searched: Bool[Array, ""]
     trusted: Bool[Array, ""]
     unrest: Float[Array, "2"]
+    map_spread: trust.MapSpread
 
 
 def _match_and_fuse(config, params, state, belief, frame, sweep, usable) -> tuple[Gaussian, _Matched]:
     """Preset "robust": align the scan fully, search where that fails, fuse what it is worth (DESIGN 1.8, 1.9)."""
     match, searched = _match(config, params, state, belief, sweep, frame.has_scan)
+    seen = jnp.where(frame.has_scan, _epoch_seen(config, state.grid, sweep, match.pose), 0.0)
+    belief, spread = trust.revisit(belief, state.map_spread, seen, params)
     lost = (match.known > _KNOWN_ENOUGH) & (match.score < _LOST_SCORE)
     lost = lost | (searched & (match.known < _FOUND_KNOWN))
     sure = trust.is_sure(match) & frame.has_scan
@@ -198,7 +201,7 @@ def _match_and_fuse(config, params, state, belief, frame, sweep, usable) -> tupl
     expected = trust.expected_match(belief)
     place = expected[:2] + match.informed @ (match.pose[:2] - expected[:2])
     match = match._replace(pose=match.pose.at[:2].set(place))
-    return belief, _Matched(match, information, poor & frame.has_scan, searched, trusted, unrest)
+    return belief, _Matched(match, information, poor & frame.has_scan, searched, trusted, unrest, spread)
 
 
 def _expected_fit(config, state, belief, sweep) -> Float[Array, ""]:
@@ -217,7 +220,7 @@ def _joint_match(config, params, state, belief, frame, sweep, usable) -> tuple[G
     pose = layout.robot_pose(corrected.mean)
     match = matching.assess(state.grid, sweep, matching.surface(sweep), pose, config.resolution)
     no = jnp.zeros((), bool)
-    matched = _Matched(match, jnp.zeros((3, 3)), no, no, frame.has_scan, state.unrest)
+    matched = _Matched(match, jnp.zeros((3, 3)), no, no, frame.has_scan, state.unrest, state.map_spread)
     return corrected if config.correction else belief, matched
 
 
@@ -280,20 +283,27 @@ def _draw(config, params, state, matched: _Matched, sweep) -> tuple[State, Bool[
     limit = jnp.array([_DRAW_PULL[0], _DRAW_PULL[0], _DRAW_PULL[1]])
     pull = jnp.clip(layout.unpack(state.belief.mean).map_error, -limit, limit)
     at = pose - jnp.minimum(1.0, novelty / _NEW_GROUND) * pull
-    grid = lax.cond(wanted, lambda g: occupancy.integrate(g, at, sweep, config.resolution), lambda g: g, state.grid)
+    epoch = 1.0 + state.map_spread.views
+    grid = lax.cond(
+        wanted, lambda g: occupancy.integrate(g, at, sweep, config.resolution, epoch), lambda g: g, state.grid
+    )
+    seen = _epoch_seen(config, grid, sweep, pose) - _epoch_seen(config, state.grid, sweep, pose)
+    seen = jnp.where(state.scans_drawn > 0, seen, 0.0)
     share = jnp.zeros((3, 3)).at[2, 2].set(novelty)
     share = share.at[:2, :2].set(matching.share_of_walls(matching.surface(sweep), new, sweep.valid, pose[2]))
     share = jnp.where(wanted & (state.scans_drawn > 0), share, 0.0)
-    exploring = wanted & (novelty > _NEW_GROUND)
-    way = jnp.where(exploring, safe_norm(pose[:2] - state.drawn_pose[:2]), 0.0)
     state = state._replace(
         belief=trust.anchor(state.belief, at, share, params),
-        map_spread=trust.learn_spread(state.map_spread, state.belief, share, way, params),
+        map_spread=trust.learn_spread(state.map_spread, state.belief, share, seen),
         grid=grid,
         drawn_pose=jnp.where(wanted, pose, state.drawn_pose),
         scans_drawn=state.scans_drawn + wanted,
     )
     return state, wanted
+
+
+def _epoch_seen(config, grid, sweep, pose):
+    return occupancy.epoch_seen(grid, transform_points(pose, sweep.points), sweep.valid, config.resolution)
 
 
 def _on_new_ground(config, grid, sweep, pose):

@@ -5,11 +5,13 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from uwbslam_jax.grid import Grid
+from uwbslam_jax.grid import EPOCH_LEVEL, Grid
 from uwbslam_jax.result import MapImage
 
 TILE = 64
 """Finest cells along a tile's side."""
+_EPOCHS = -1
+"""Where the epochs stand among the layers of a tile, whose other keys are the pyramid's levels."""
 _SLACK = 2
 """The window moves when the robot is more than this many tiles off its middle."""
 
@@ -19,7 +21,7 @@ class Tiles:
 
     def __init__(self, resolution: float):
         self.resolution = resolution
-        self._kept: dict[tuple[int, int], list[np.ndarray]] = {}
+        self._kept: dict[tuple[int, int], dict[int, np.ndarray]] = {}
 
     def __len__(self) -> int:
         return len(self._kept)
@@ -41,26 +43,28 @@ class Tiles:
         cells = grid.levels[0].shape[0]
         origin = np.asarray(grid.origin)
         shift = self._offset(origin, cells, robot)
-        old = [np.asarray(level) for level in grid.levels]
-        new = [np.zeros_like(level) for level in old]
+        old = {k: np.asarray(level) for k, level in enumerate(grid.levels)}
+        old[_EPOCHS] = np.asarray(grid.epochs)
+        new = {k: np.zeros_like(layer) for k, layer in old.items()}
         count = cells // TILE
         first = np.round(origin / (TILE * self.resolution)).astype(int)
         for row in range(count):
             for col in range(count):
                 r, c = row - shift[1], col - shift[0]
-                blocks = [level[_block(k, row, col)] for k, level in enumerate(old)]
+                blocks = {k: layer[_block(k, row, col)] for k, layer in old.items()}
                 if 0 <= r < count and 0 <= c < count:
-                    for k, block in enumerate(blocks):
+                    for k, block in blocks.items():
                         new[k][_block(k, r, c)] = block
-                elif any(block.any() for block in blocks):
-                    self._kept[first[1] + row, first[0] + col] = [block.copy() for block in blocks]
+                elif any(block.any() for block in blocks.values()):
+                    self._kept[first[1] + row, first[0] + col] = {k: block.copy() for k, block in blocks.items()}
         first = first + shift
         for row in range(count):
             for col in range(count):
-                for k, block in enumerate(self._kept.pop((first[1] + row, first[0] + col), [])):
+                for k, block in self._kept.pop((first[1] + row, first[0] + col), {}).items():
                     new[k][_block(k, row, col)] = block
         corner = first * (TILE * self.resolution)
-        return Grid(tuple(jnp.asarray(level) for level in new), jnp.asarray(corner, jnp.float32))
+        levels = tuple(jnp.asarray(new[k]) for k in range(len(grid.levels)))
+        return Grid(levels, jnp.asarray(corner, jnp.float32), jnp.asarray(new[_EPOCHS]))
 
     def image(self, grid: Grid) -> MapImage:
         """The whole map at the finest level, window and tiles, cropped to what was observed."""
@@ -85,6 +89,6 @@ class Tiles:
         return MapImage(whole, self.resolution, low[::-1] * side)
 
 
-def _block(level: int, row: int | np.integer, col: int | np.integer) -> tuple[slice, slice]:
-    size = TILE >> level
+def _block(layer: int, row: int | np.integer, col: int | np.integer) -> tuple[slice, slice]:
+    size = TILE >> (EPOCH_LEVEL if layer == _EPOCHS else layer)
     return slice(row * size, (row + 1) * size), slice(col * size, (col + 1) * size)

@@ -41,6 +41,10 @@ _JUMP = (0.5, 1.0)
 """Largest standard deviation that a jump is given [m, rad]."""
 _CONTRADICTION = 6.0
 """How much worse the ranges may fit a jump than what was expected (difference of robust squares)."""
+_OTHER_EPOCH = 0.1
+"""Ground drawn within so much of a view of each other errs alike."""
+_PATCHES = 4.0
+"""So many patches of a view err each by itself where a scan says little of how they hang together."""
 _SHORTEST_S = 0.05
 """A jump is taken to have lasted at least so long [s]."""
 
@@ -50,25 +54,18 @@ class MapSpread(NamedTuple):
 
     Attributes:
       apart: (3, 3) mean covariance of a match where new ground was drawn: how much neighbouring ground may differ.
-      views: how much new ground that is, in views.
-      drift: (3, 3) what drawing new ground added to the map error so far [m, m, rad].
-      way: how far was driven on new ground [m].
+      views: how much new ground was drawn, in views; the epoch of what is drawn next is one more.
+      epoch: of the ground that the map error in the state belongs to.
     """
 
     apart: Float[Array, "3 3"]
     views: Float[Array, ""]
-    drift: Float[Array, "3 3"]
-    way: Float[Array, ""]
-
-    @property
-    def rate(self) -> Float[Array, "3 3"]:
-        """Random walk of the map error with the way [1/m]."""
-        return self.drift / jnp.maximum(self.way, 1.0)
+    epoch: Float[Array, ""]
 
 
 def even_map() -> MapSpread:
     """Of a map that nothing was drawn into yet."""
-    return MapSpread(jnp.zeros((3, 3)), jnp.zeros(()), jnp.zeros((3, 3)), jnp.zeros(()))
+    return MapSpread(jnp.zeros((3, 3)), jnp.zeros(()), jnp.ones(()))
 
 
 def expected_match(belief: Gaussian) -> Float[Array, "3"]:
@@ -144,19 +141,34 @@ def drawing_error(share: Float[Array, "3 3"], params: Params) -> Float[Array, "3
     return noise @ noise.T / jnp.maximum(safe_norm(share.ravel()), 1e-3)
 
 
-def learn_spread(
-    spread: MapSpread, belief: Gaussian, share: Float[Array, "3 3"], way: Float[Array, ""], params: Params
-) -> MapSpread:
+def learn_spread(spread: MapSpread, belief: Gaussian, share: Float[Array, "3 3"], seen: Float[Array, ""]) -> MapSpread:
     """Spread of the map's errors after a scan was drawn with a share of new ground.
 
     Args:
-      belief: before the scan was drawn. way: driven since the last scan on new ground [m].
+      belief: before the scan was drawn. seen: by how much drawing it changed the epoch that is seen: that much of the
+        map error is accounted for.
     """
     C = layout.matched_pose_jacobian(layout.node_count(belief.mean.shape[0]))
     new = jnp.mean(jnp.diagonal(share))
     views = spread.views + new
     apart = spread.apart + new / jnp.maximum(views, 1e-6) * (C @ belief.cov @ C.T - spread.apart)
-    return MapSpread(apart, views, spread.drift + drawing_error(share, params), spread.way + way)
+    return MapSpread(apart, views, spread.epoch + seen)
+
+
+def revisit(belief: Gaussian, spread: MapSpread, seen: Float[Array, ""], params: Params) -> tuple[Gaussian, MapSpread]:
+    """The belief over ground of another epoch: the map errs there by something else, the more so the more was drawn in
+    between. So a loop is closed by what is seen, and not by what was true at its other end.
+
+    Args:
+      seen: mean epoch of the ground in view, 0 where none was drawn before.
+    """
+    apart = jnp.abs(seen - spread.epoch)
+    other = (seen > 0) & (apart > _OTHER_EPOCH)
+    added = jnp.diag(jnp.stack([params.sigma_map, params.sigma_map, params.sigma_map_yaw]) ** 2)
+    added = added + _PATCHES * spread.apart
+    error = jnp.array(layout.map_error_indices(layout.node_count(belief.mean.shape[0])))
+    cov = belief.cov.at[error[:, None], error].add(jnp.where(other, apart, 0.0) * added)
+    return belief._replace(cov=cov), spread._replace(epoch=jnp.where(other, seen, spread.epoch))
 
 
 def learn_unrest(
