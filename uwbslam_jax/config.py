@@ -187,10 +187,10 @@ class FilterSettings:
     """Standard deviation of one beam's residual 1 - Gamma."""
     independent_beams: float = 50.0
     """So many beams of a scan count as independent in a match's information, however many there are."""
-    sigma_map: float = 0.05
-    """What a scan of new ground adds to the map's own position error besides that of the pose it is drawn at [m]."""
-    sigma_map_yaw: float = 0.008
-    """The same for its heading [rad]."""
+    sigma_map: float = 0.01
+    """Random walk of the map's own position error with the way on which it was drawn [m/m^0.5]."""
+    sigma_map_yaw: float = 0.0015
+    """The same for its heading [rad/m^0.5]."""
 
 
 @dataclass(frozen=True)

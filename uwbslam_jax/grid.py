@@ -31,8 +31,8 @@ class Grid(NamedTuple):
     Attributes:
       levels: log-odds of the pyramid's levels, finest first, each (cells, cells); 0 is unknown.
       origin: (2,) corner [m].
-      epochs: when each patch of ground was first drawn, in views of new ground drawn until then; 0 is never. Its cells
-        are resolution * 2^EPOCH_LEVEL.
+      epochs: when each patch of ground was first drawn, by the way driven until then [m]; 0 is never. Its cells are
+        resolution * 2^EPOCH_LEVEL.
     """
 
     levels: tuple[Float[Array, "_ _"], ...]

@@ -18,7 +18,7 @@ from uwbslam_jax import grid as occupancy
 from uwbslam_jax import layout, matching, motion, paper, ranging, trust
 from uwbslam_jax.config import Config, Params
 from uwbslam_jax.ekf import Gaussian
-from uwbslam_jax.geometry import rotation, transform_points, wrap_angle
+from uwbslam_jax.geometry import rotation, safe_norm, transform_points, wrap_angle
 from uwbslam_jax.grid import Grid, Sweep
 from uwbslam_jax.matching import Match
 from uwbslam_jax.measurements import Frame, Scan
@@ -150,7 +150,7 @@ def step(config: Config, params: Params, state: State, frame: Frame) -> tuple[St
     align = _joint_match if config.preset == "paper" else _match_and_fuse
     belief, matched = align(config, params, state, belief, frame, sweep, usable)
     state = state._replace(belief=belief, unrest=matched.unrest, map_spread=matched.map_spread)
-    state, drawn = _draw(config, params, state, matched, sweep)
+    state, drawn = _draw(config, state, matched, sweep)
     return state, _report(state, matched, used, drawn)
 
 
@@ -269,7 +269,7 @@ def _match(config, params, state, belief, sweep, has_scan) -> tuple[Match, Bool[
     return lax.cond(wanted, wide, lambda _: match, None), wanted
 
 
-def _draw(config, params, state, matched: _Matched, sweep) -> tuple[State, Bool[Array, ""]]:
+def _draw(config, state, matched: _Matched, sweep) -> tuple[State, Bool[Array, ""]]:
     """The map with the scan drawn, when it may be and the robot has moved or turned since the last one.
 
     New ground is drawn at a known place, so what the map errs by there is known to be the pose's own error.
@@ -283,18 +283,19 @@ def _draw(config, params, state, matched: _Matched, sweep) -> tuple[State, Bool[
     limit = jnp.array([_DRAW_PULL[0], _DRAW_PULL[0], _DRAW_PULL[1]])
     pull = jnp.clip(layout.unpack(state.belief.mean).map_error, -limit, limit)
     at = pose - jnp.minimum(1.0, novelty / _NEW_GROUND) * pull
-    epoch = 1.0 + state.map_spread.views
     grid = lax.cond(
-        wanted, lambda g: occupancy.integrate(g, at, sweep, config.resolution, epoch), lambda g: g, state.grid
+        wanted,
+        lambda g: occupancy.integrate(g, at, sweep, config.resolution, state.map_spread.way),
+        lambda g: g,
+        state.grid,
     )
-    seen = _epoch_seen(config, grid, sweep, pose) - _epoch_seen(config, state.grid, sweep, pose)
-    seen = jnp.where(state.scans_drawn > 0, seen, 0.0)
+    way = jnp.where(wanted, safe_norm(pose[:2] - state.drawn_pose[:2]), 0.0)
     share = jnp.zeros((3, 3)).at[2, 2].set(novelty)
     share = share.at[:2, :2].set(matching.share_of_walls(matching.surface(sweep), new, sweep.valid, pose[2]))
     share = jnp.where(wanted & (state.scans_drawn > 0), share, 0.0)
     state = state._replace(
-        belief=trust.anchor(state.belief, at, share, params),
-        map_spread=trust.learn_spread(state.map_spread, state.belief, share, seen),
+        belief=trust.anchor(state.belief, at, share),
+        map_spread=trust.learn_spread(state.map_spread, state.belief, share, way),
         grid=grid,
         drawn_pose=jnp.where(wanted, pose, state.drawn_pose),
         scans_drawn=state.scans_drawn + wanted,

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from uwbslam_jax import grid as occupancy
-from uwbslam_jax import layout, slam, trust
+from uwbslam_jax import layout, slam
 from uwbslam_jax.config import Config, Params
 from uwbslam_jax.ekf import Gaussian
 from uwbslam_jax.hypotheses import explanations
@@ -190,7 +190,7 @@ def adopt(
         frame_slots=jnp.array(frame_slots, jnp.int32),
         scatter=state.scatter._replace(log=jnp.asarray(buffer.scatter(config.nodes), jnp.float32)),
         grid=grid,
-        map_spread=trust.even_map()._replace(apart=state.map_spread.apart),
+        map_spread=state.map_spread._replace(epoch=jnp.ones(())),
         drawn_pose=jnp.asarray(y(x)[:3], jnp.float32),
     )
     return Adopted(adopted, np.array([key.frame.stamp for key in keys]), before, after)

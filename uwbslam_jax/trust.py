@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from uwbslam_jax import layout, ranging
 from uwbslam_jax.config import Params
 from uwbslam_jax.ekf import Gaussian, update_information
-from uwbslam_jax.geometry import safe_norm, wrap_angle
+from uwbslam_jax.geometry import wrap_angle
 from uwbslam_jax.matching import Match
 from uwbslam_jax.measurements import Frame
 
@@ -41,10 +41,10 @@ _JUMP = (0.5, 1.0)
 """Largest standard deviation that a jump is given [m, rad]."""
 _CONTRADICTION = 6.0
 """How much worse the ranges may fit a jump than what was expected (difference of robust squares)."""
-_OTHER_EPOCH = 0.1
-"""Ground drawn within so much of a view of each other errs alike."""
-_PATCHES = 4.0
-"""So many patches of a view err each by itself where a scan says little of how they hang together."""
+_OTHER_EPOCH = 0.5
+"""Ground drawn within so much way of each other errs alike [m]."""
+_PATCH_M = 2.0
+"""Ground so far apart on the way errs each by itself where scans say little of how it hangs together [m]."""
 _SHORTEST_S = 0.05
 """A jump is taken to have lasted at least so long [s]."""
 
@@ -54,18 +54,20 @@ class MapSpread(NamedTuple):
 
     Attributes:
       apart: (3, 3) mean covariance of a match where new ground was drawn: how much neighbouring ground may differ.
-      views: how much new ground was drawn, in views; the epoch of what is drawn next is one more.
-      epoch: of the ground that the map error in the state belongs to.
+      views: how much new ground that is, in views.
+      way: how far was driven [m]; the epoch of what is drawn next.
+      epoch: of the ground that the map error in the state belongs to [m].
     """
 
     apart: Float[Array, "3 3"]
     views: Float[Array, ""]
+    way: Float[Array, ""]
     epoch: Float[Array, ""]
 
 
 def even_map() -> MapSpread:
     """Of a map that nothing was drawn into yet."""
-    return MapSpread(jnp.zeros((3, 3)), jnp.zeros(()), jnp.ones(()))
+    return MapSpread(jnp.zeros((3, 3)), jnp.zeros(()), jnp.ones(()), jnp.ones(()))
 
 
 def expected_match(belief: Gaussian) -> Float[Array, "3"]:
@@ -114,8 +116,8 @@ def fuse(belief: Gaussian, match: Match, information: Float[Array, "3 3"]) -> Ga
     return update_information(belief, C.T @ information @ C, C.T @ (information @ innovation))
 
 
-def anchor(belief: Gaussian, at: Float[Array, "3"], share: Float[Array, "3 3"], params: Params) -> Gaussian:
-    """The belief after a scan was drawn: e <- (1 - N) e + N (at - pose) + w, w as in `drawing_error`.
+def anchor(belief: Gaussian, at: Float[Array, "3"], share: Float[Array, "3 3"]) -> Gaussian:
+    """The belief after a scan was drawn: e <- (1 - N) e + N (at - pose).
 
     Where new ground is drawn the map errs by what the pose errs by, whatever it was before: the map error is carried
     over with its covariance, so that ranges that later mend the pose mend what the map is taken for as well.
@@ -130,42 +132,33 @@ def anchor(belief: Gaussian, at: Float[Array, "3"], share: Float[Array, "3 3"], 
     mean = belief.mean.at[error].add(share @ (apart - belief.mean[error]))
     F = jnp.eye(belief.mean.shape[0])
     F = F.at[error[:, None], error].add(-share).at[error[:, None], pose].add(-share)
-    cov = F @ belief.cov @ F.T
-    return Gaussian(mean, cov.at[error[:, None], error].add(drawing_error(share, params)))
+    return Gaussian(mean, F @ belief.cov @ F.T)
 
 
-def drawing_error(share: Float[Array, "3 3"], params: Params) -> Float[Array, "3 3"]:
-    """Covariance of what drawing new ground adds to the map error besides the pose's own: sigma_map for a whole view,
-    and as much for one that is drawn in many small parts."""
-    noise = share * jnp.stack([params.sigma_map, params.sigma_map, params.sigma_map_yaw])
-    return noise @ noise.T / jnp.maximum(safe_norm(share.ravel()), 1e-3)
-
-
-def learn_spread(spread: MapSpread, belief: Gaussian, share: Float[Array, "3 3"], seen: Float[Array, ""]) -> MapSpread:
+def learn_spread(spread: MapSpread, belief: Gaussian, share: Float[Array, "3 3"], way: Float[Array, ""]) -> MapSpread:
     """Spread of the map's errors after a scan was drawn with a share of new ground.
 
     Args:
-      belief: before the scan was drawn. seen: by how much drawing it changed the epoch that is seen: that much of the
-        map error is accounted for.
+      belief: before the scan was drawn. way: driven since the last one that was [m].
     """
     C = layout.matched_pose_jacobian(layout.node_count(belief.mean.shape[0]))
     new = jnp.mean(jnp.diagonal(share))
     views = spread.views + new
     apart = spread.apart + new / jnp.maximum(views, 1e-6) * (C @ belief.cov @ C.T - spread.apart)
-    return MapSpread(apart, views, spread.epoch + seen)
+    return MapSpread(apart, views, spread.way + way, spread.epoch)
 
 
 def revisit(belief: Gaussian, spread: MapSpread, seen: Float[Array, ""], params: Params) -> tuple[Gaussian, MapSpread]:
-    """The belief over ground of another epoch: the map errs there by something else, the more so the more was drawn in
-    between. So a loop is closed by what is seen, and not by what was true at its other end.
+    """The belief over ground of another epoch: the map errs there by something else, the more so the farther was driven
+    in between. So a loop is closed by what is seen, and not by what was true at its other end.
 
     Args:
-      seen: mean epoch of the ground in view, 0 where none was drawn before.
+      seen: mean epoch of the ground in view [m], 0 where none was drawn before.
     """
     apart = jnp.abs(seen - spread.epoch)
     other = (seen > 0) & (apart > _OTHER_EPOCH)
     added = jnp.diag(jnp.stack([params.sigma_map, params.sigma_map, params.sigma_map_yaw]) ** 2)
-    added = added + _PATCHES * spread.apart
+    added = added + spread.apart / _PATCH_M
     error = jnp.array(layout.map_error_indices(layout.node_count(belief.mean.shape[0])))
     cov = belief.cov.at[error[:, None], error].add(jnp.where(other, apart, 0.0) * added)
     return belief._replace(cov=cov), spread._replace(epoch=jnp.where(other, seen, spread.epoch))
