@@ -42,7 +42,7 @@ _DRAW_FIRST = 10
 """The first scans are all drawn: there is no map yet to be blurred."""
 _NEW_GROUND = 0.02
 """Share of new ground in a scan from which on it is drawn where the ranges say, not where the old map says."""
-_DRAW_PULL = (0.015, 0.0005)
+_DRAW_PULL = (0.003, 0.0003)
 """New ground is drawn at most this far from the match towards the fused pose [m, rad]."""
 
 
