@@ -23,7 +23,7 @@ BIAS_M = 0.3
 """Prior spread of a node's bias [m]."""
 _PLACE_M = 0.5
 """Ranges to one beacon taken within so much are one mean."""
-_FLOOR_M = 0.04
+_FLOOR_M = 0.05
 """However many ranges are averaged, and however well the robot is known there: the map bends."""
 _FEWEST_PLACES = 12
 """A beacon ranged from fewer places tells nothing."""

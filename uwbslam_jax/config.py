@@ -187,9 +187,9 @@ class FilterSettings:
     """Standard deviation of one beam's residual 1 - Gamma."""
     independent_beams: float = 50.0
     """So many beams of a scan count as independent in a match's information, however many there are."""
-    sigma_map: float = 0.01
+    sigma_map: float = 0.004
     """Random walk of the map's own position error with the way on which it was drawn [m/m^0.5]."""
-    sigma_map_yaw: float = 0.0015
+    sigma_map_yaw: float = 0.0006
     """The same for its heading [rad/m^0.5]."""
 
 

@@ -35,6 +35,9 @@ _SOLVE_EVERY_S = 1.0
 
 _CALIBRATE_EVERY_S = 5.0
 """Biases are looked for this often, in the log's time."""
+_NEWS = 3.0
+"""What the whole run tells is taken over when it explains the ranges better by so many times what decides: its poses
+are not independent of each other, though they are taken to be."""
 
 TRACES: Counter[str] = Counter()
 """How often each compiled function was traced, by name; a test counts them."""
@@ -214,7 +217,7 @@ class Session:
         configured = make_params(self.settings, self._slots)
         places = np.asarray(layout.unpack(self.state.belief.mean).positions, float)
         solution = self._calibration.solve(places, self.found_bias, configured)
-        if solution is None or not solution.known or solution.gain < DECIDED:
+        if solution is None or not solution.known or solution.gain < _NEWS * DECIDED:
             return
         if solution.biased:
             if not self.found_bias:

@@ -41,9 +41,9 @@ _JUMP = (0.5, 1.0)
 """Largest standard deviation that a jump is given [m, rad]."""
 _CONTRADICTION = 6.0
 """How much worse the ranges may fit a jump than what was expected (difference of robust squares)."""
-_OTHER_EPOCH = 0.5
+_OTHER_EPOCH = 3.0
 """Ground drawn within so much way of each other errs alike [m]."""
-_PATCH_M = 2.0
+_PATCH_M = 8.0
 """Ground so far apart on the way errs each by itself where scans say little of how it hangs together [m]."""
 _SHORTEST_S = 0.05
 """A jump is taken to have lasted at least so long [s]."""
