@@ -13,7 +13,7 @@ from derivatives import assert_gradient, double
 
 from uwbslam_jax import grid as occupancy
 from uwbslam_jax.geometry import transform_points
-from uwbslam_jax.grid import CLAMP, FREE, FREE_REACH_M, HIT, Grid, Sweep
+from uwbslam_jax.grid import CLAMP, EPOCH_LEVEL, FREE, FREE_REACH_M, HIT, Grid, Sweep
 from uwbslam_jax.slam import undo_motion
 
 CELLS, LEVELS, RESOLUTION = 64, 2, 0.2
@@ -176,10 +176,64 @@ def test_log_odds_are_clamped_at_both_ends():
     assert CLAMP[0] + 2 * HIT > 0
 
 
+# The grid's ground has patches of 3.2 m, from corners at -6.4, -3.2, 0 and 3.2 m: 4 x 4 of them.
+
+PATCH = RESOLUTION * 2**EPOCH_LEVEL
+
+
+def patches(grid: Grid, points, inside=True) -> set[tuple[int, int]]:
+    """Rows and columns of the ground's patches that points lie on."""
+    at = np.floor((np.asarray(points, float) - np.asarray(grid.origin, float)) / PATCH).astype(int)
+    return {(int(row), int(col)) for col, row in at[np.broadcast_to(inside, len(at))]}
+
+
+def seen(grid: Grid, points, valid=True) -> float:
+    points = jnp.asarray(points, jnp.float32)
+    return float(occupancy.epoch_seen(grid, points, jnp.broadcast_to(jnp.asarray(valid), len(points)), RESOLUTION))
+
+
+def test_ground_keeps_the_epoch_when_it_was_first_drawn():
+    east, west = (sweep_of(half) for half in (facing(0.0), facing(np.pi)))
+    first = integrate(empty(), jnp.zeros(3), east, RESOLUTION, 5.0)
+    after = integrate(first, jnp.zeros(3), west, RESOLUTION, 9.0)
+    again = integrate(after, jnp.zeros(3), east, RESOLUTION, 30.0)
+    in_east = patches(first, east.points, np.asarray(east.valid))
+    in_west = patches(first, west.points, np.asarray(west.valid))
+    assert in_east & in_west  # where both were drawn, the first counts
+    assert in_west - in_east
+    for row in range(len(after.epochs)):
+        for col in range(len(after.epochs)):
+            want = 5.0 if (row, col) in in_east else 9.0 if (row, col) in in_west else 0.0
+            assert float(after.epochs[row, col]) == want
+    np.testing.assert_array_equal(again.epochs, after.epochs)
+
+
+def facing(bearing: float):
+    """A scan of the half of the room in a direction."""
+    scan = room.scan(np.zeros(3), 90)
+    bearings = scan.angle_min + scan.angle_increment * np.arange(90)
+    return scan._replace(valid=np.cos(bearings - bearing) > -0.2)
+
+
+def test_epoch_seen_is_the_mean_over_beams_that_end_on_drawn_ground():
+    grid = empty()._replace(epochs=jnp.zeros((4, 4), jnp.float32).at[0, 1].set(4.0).at[2, 3].set(10.0))
+    a, b, never, outside = (-1.0, -5.0), (5.0, 1.0), (1.0, 1.0), (50.0, 0.0)
+    assert seen(grid, [a, a, a, b]) == pytest.approx(5.5)
+    assert seen(grid, [a, b, never, never, outside]) == pytest.approx(7.0)
+    assert seen(grid, [a, b], [True, False]) == pytest.approx(4.0)
+    assert seen(grid, [never, outside]) == 0.0
+    assert seen(grid, [a, b], False) == 0.0
+
+
+def test_what_ends_outside_the_window_gives_no_ground_an_epoch():
+    after = integrate(empty(), jnp.array([40.0, 40.0, 0.0]), sweep_at((0.0, 0.0, 0.0)), RESOLUTION, 5.0)
+    np.testing.assert_array_equal(after.epochs, 0.0)
+
+
 def random_grid(seed: int = 0) -> Grid:
     rng = np.random.default_rng(seed)
     levels = tuple(jnp.asarray(rng.normal(size=(CELLS >> k, CELLS >> k)), jnp.float32) for k in range(LEVELS))
-    return Grid(levels, jnp.array([-5.0, 2.0], jnp.float32))
+    return empty()._replace(levels=levels, origin=jnp.array([-5.0, 2.0], jnp.float32))
 
 
 def bilinear(grid: Grid, point, level: int) -> float:
@@ -224,7 +278,7 @@ def test_gradient_of_lookup_agrees_with_finite_differences(level):
     def value(at):
         points, level_values, origin = at
         levels = (*grid.levels[:level], level_values, *grid.levels[level + 1 :])
-        return weights @ occupancy.lookup(Grid(levels, origin), points, RESOLUTION, level)
+        return weights @ occupancy.lookup(grid._replace(levels=levels, origin=origin), points, RESOLUTION, level)
 
     gradient = assert_gradient(value, (points, grid.levels[level], grid.origin))
     assert int((gradient[1] != 0).sum()) > 60  # four cells a point
@@ -247,12 +301,12 @@ def test_gradient_of_a_drawn_map_with_respect_to_what_it_adds_to():
     """Drawing adds constants to cells: its derivative is 1 where nothing was clamped; poses only decide which cells."""
     sweep = double(sweep_at((0.0, 0.0, 0.0), beams=30))
     before = double(random_grid())
-    before = Grid(tuple(0.1 * level for level in before.levels), double(empty().origin))
+    before = double(empty())._replace(levels=tuple(0.1 * level for level in before.levels))
     weights = jnp.asarray(np.random.default_rng(4).normal(size=(CELLS, CELLS)))
 
     def value(at):
         levels, pose = at
-        after = integrate(Grid((levels, before.levels[1]), before.origin), pose, sweep, RESOLUTION)
+        after = integrate(before._replace(levels=(levels, before.levels[1])), pose, sweep, RESOLUTION)
         return jnp.sum(weights * after.levels[0])
 
     gradient = assert_gradient(value, (before.levels[0], jnp.array([0.01, 0.02, 0.03])), count=3)

@@ -124,6 +124,35 @@ def test_the_end_of_a_corridor_tells_nothing_before_it_is_drawn():
     np.testing.assert_allclose(known.informed, np.eye(2), atol=1e-6)
 
 
+def share_of_walls(sweep, some, heading) -> np.ndarray:
+    return np.asarray(matching.share_of_walls(matching.surface(sweep), some, sweep.valid, jnp.float32(heading)))
+
+
+@pytest.mark.parametrize("heading", [0.0, 0.7, -2.0])
+def test_walls_along_x_tell_y_and_nothing_else_and_all_walls_tell_all(heading):
+    """In the world's frame, whichever way the robot looks."""
+    pose = np.array([0.33, -0.41, heading])
+    sweep = sweep_at(pose)
+    everything = share_of_walls(sweep, sweep.valid, heading)
+    np.testing.assert_allclose(everything, np.eye(2), atol=0.03)  # what counts as few is 0.006 of a third to a half
+    c, s = np.cos(heading), np.sin(heading)
+    ends = np.asarray(sweep.points) @ np.array([[c, s], [-s, c]]) + pose[:2]
+    ys = [wall[0, 1] for wall in room.WALLS if wall[0, 1] == wall[1, 1]]
+    along_x = np.abs(ends[:, 1, None] - ys).min(axis=1) < 1e-3
+    assert 0.3 < along_x.mean() < 0.7
+    some = share_of_walls(sweep, jnp.asarray(along_x), heading)
+    np.testing.assert_allclose(some, np.diag([0.0, 1.0]), atol=0.05)  # as above, and surfaces beside the corners
+    rest = share_of_walls(sweep, jnp.asarray(~along_x), heading)
+    np.testing.assert_allclose(some + rest, everything, atol=1e-5)  # float32
+    np.testing.assert_array_equal(share_of_walls(sweep, jnp.zeros(BEAMS, bool), heading), 0.0)
+
+
+def test_walls_of_a_scan_without_beams_have_no_share():
+    sweep = sweep_at((0.0, 0.0, 0.0))
+    blind = sweep._replace(valid=jnp.zeros(BEAMS, bool))
+    np.testing.assert_array_equal(share_of_walls(blind, blind.valid, 0.3), 0.0)
+
+
 def test_a_scan_without_beams_stays_at_the_prior(room_map):
     sweep = sweep_at((0.0, 0.0, 0.0))
     blind = sweep._replace(valid=jnp.zeros(BEAMS, bool))

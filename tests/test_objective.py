@@ -33,7 +33,7 @@ def case():
 @jax.jit
 def residuals(pose, level, origin, points, valid):
     """1 - Gamma of each beam by itself, 0 where it did not return: the first term of eq. (opt)."""
-    window = occupancy.Grid((level,), origin)
+    window = occupancy.Grid((level,), origin, jnp.zeros((1, 1)))
     return jnp.where(valid, 1.0 - occupancy.lookup(window, transform_points(pose, points), SIZE), 0.0)
 
 

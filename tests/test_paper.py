@@ -59,7 +59,7 @@ def joint() -> paper._Joint:
 def gamma_of_beams(delta, a: paper._Joint):
     """Gamma(f_i) of every beam at an offset (positions, heading)."""
     pose = jnp.stack([a.vector[0] + delta[0], a.vector[1] + delta[1], a.vector[4 * NODES] + delta[-1]])
-    window = occupancy.Grid((a.level,), a.origin)
+    window = occupancy.Grid((a.level,), a.origin, jnp.zeros((1, 1)))
     return occupancy.lookup(window, transform_points(pose, a.points), float(a.size))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from uwbslam_jax import grid as occupancy
-from uwbslam_jax.grid import Grid
+from uwbslam_jax.grid import EPOCH_LEVEL, Grid
 from uwbslam_jax.tiles import TILE, Tiles
 
 CELLS, LEVELS, RESOLUTION = 4 * TILE, 3, 0.1
@@ -15,16 +15,18 @@ SIDE = TILE * RESOLUTION
 
 
 def patterned(seed: int = 0) -> Grid:
-    """A window at the origin with different log-odds in every cell."""
+    """A window at the origin with different log-odds in every cell and a different epoch in every patch."""
     rng = np.random.default_rng(seed)
     levels = tuple(jnp.asarray(rng.normal(size=(CELLS >> k, CELLS >> k)), jnp.float32) for k in range(LEVELS))
-    return Grid(levels, occupancy.empty(CELLS, LEVELS, RESOLUTION).origin)
+    epochs = jnp.asarray(rng.uniform(1, 100, (CELLS >> EPOCH_LEVEL, CELLS >> EPOCH_LEVEL)), jnp.float32)
+    return Grid(levels, occupancy.empty(CELLS, LEVELS, RESOLUTION).origin, epochs)
 
 
 def assert_same(a: Grid, b: Grid) -> None:
     np.testing.assert_allclose(a.origin, b.origin, atol=1e-5)  # float32 [m]
     for x, y in zip(a.levels, b.levels, strict=True):
         np.testing.assert_array_equal(x, y)
+    np.testing.assert_array_equal(a.epochs, b.epochs)
 
 
 @pytest.mark.parametrize("robot", [(20.0, 0.0), (-20.0, 7.0), (0.0, 16.0), (300.0, -200.0)])
@@ -55,6 +57,9 @@ def test_cells_that_stay_in_the_window_keep_their_place_in_the_world():
         np.testing.assert_array_equal(moved.levels[k][2 * t :, : 3 * t], grid.levels[k][: 2 * t, t:])
         np.testing.assert_array_equal(moved.levels[k][: 2 * t], 0.0)
         np.testing.assert_array_equal(moved.levels[k][:, 3 * t :], 0.0)
+    t = TILE >> EPOCH_LEVEL
+    np.testing.assert_array_equal(moved.epochs[2 * t :, : 3 * t], grid.epochs[: 2 * t, t:])
+    assert np.count_nonzero(moved.epochs) == 6 * t**2
     points = jnp.array([[1.03, -3.01], [8.2, -11.7], [3.3, -7.7]])
     for k in range(LEVELS):
         before = occupancy.lookup(grid, points, RESOLUTION, k)

@@ -25,6 +25,8 @@ CALM = jnp.array(trust.CALM) ** 2
 
 weigh, fuse, learn_unrest = jax.jit(trust.weigh), jax.jit(trust.fuse), jax.jit(trust.learn_unrest)
 allow_jump, contradicted = jax.jit(trust.allow_jump), jax.jit(trust.contradicted)
+anchor, revisit, learn_spread = jax.jit(trust.anchor), jax.jit(trust.revisit), jax.jit(trust.learn_spread)
+AT, ERROR = np.array(layout.pose_indices(NODES)), np.array(layout.map_error_indices(NODES))
 
 
 def expecting(pose=(0.0, 0.0, 0.0), velocity=(0.0, 0.0)) -> Gaussian:
@@ -145,3 +147,126 @@ def test_what_the_scan_does_not_need_or_was_expected_anyway_teaches_nothing():
     np.testing.assert_allclose(learnt(errors, needed=1.0), trust.CALM, rtol=1e-6)
     np.testing.assert_allclose(learnt(errors, std=0.3), trust.CALM, rtol=1e-6)
     assert learnt(errors).min() > 0.1
+
+
+# What the map errs by.
+
+
+def uncertain(seed: int = 0) -> Gaussian:
+    """A pose and a map error, correlated with each other and with all else."""
+    rng = np.random.default_rng(seed)
+    root = 0.05 * rng.normal(size=(SIZE, SIZE))
+    belief = expecting(pose=(1.0, -2.0, 3.1))
+    mean = belief.mean.at[ERROR].set(jnp.array([0.2, -0.1, 0.03]))
+    return Gaussian(mean, jnp.asarray(root @ root.T, jnp.float32))
+
+
+def blocks(cov) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Covariance of the pose, of the map error, and of the map error with the pose."""
+    cov = np.asarray(cov, float)
+    return cov[np.ix_(AT, AT)], cov[np.ix_(ERROR, ERROR)], cov[np.ix_(ERROR, AT)]
+
+
+def test_where_all_is_new_the_map_errs_by_what_the_pose_errs_by():
+    before = uncertain()
+    at = jnp.array([1.3, -2.1, -3.1])  # 0.083 rad on from 3.1, through the half turn
+    after = anchor(before, at, jnp.eye(3))
+    np.testing.assert_allclose(after.mean[ERROR], [0.3, -0.1, 2 * np.pi - 6.2], atol=1e-5)  # float32
+    pose, error, cross = blocks(after.cov)
+    np.testing.assert_allclose(error, pose, atol=1e-7)
+    np.testing.assert_allclose(cross, -pose, atol=1e-7)
+    # a match there is expected where the scan was drawn, and nowhere else
+    expected = np.asarray(trust.expected_match(after)) - np.asarray(at)
+    np.testing.assert_allclose(np.exp(1j * expected), 1.0, atol=1e-5)
+    # nothing is learnt of anything else
+    others = np.setdiff1d(np.arange(SIZE), ERROR)
+    np.testing.assert_array_equal(after.mean[others], before.mean[others])
+    np.testing.assert_array_equal(after.cov[np.ix_(others, others)], before.cov[np.ix_(others, others)])
+
+
+def test_where_nothing_is_new_the_map_errs_as_before():
+    before = uncertain()
+    after = anchor(before, jnp.array([5.0, 5.0, 1.0]), jnp.zeros((3, 3)))
+    np.testing.assert_array_equal(after.mean, before.mean)
+    np.testing.assert_allclose(after.cov, before.cov, atol=1e-8)  # float32
+
+
+def test_a_share_of_new_ground_moves_the_map_error_by_as_much():
+    """Along y all is new, along x nothing, of the heading half."""
+    before = uncertain()
+    after = anchor(before, jnp.array([1.3, -2.4, 3.15]), jnp.diag(jnp.array([0.0, 1.0, 0.5])))
+    np.testing.assert_allclose(after.mean[ERROR], [0.2, -0.4, (0.03 + 0.05) / 2], atol=1e-5)
+    pose, error, _ = blocks(after.cov)
+    _, was, _ = blocks(before.cov)
+    np.testing.assert_allclose([error[0, 0], error[1, 1]], [was[0, 0], pose[1, 1]], rtol=1e-5)
+
+
+def test_ranges_that_mend_a_pose_mend_what_its_map_errs_by():
+    """The pose is found 0.1 m further on than where the scan was drawn: so the map errs by -0.1 m."""
+    before = expecting()
+    drawn = anchor(before, jnp.zeros(3), jnp.eye(3))
+    gain = drawn.cov[:, 0] / drawn.cov[0, 0]
+    mended = drawn.mean + 0.1 * gain
+    np.testing.assert_allclose([mended[0], mended[ERROR[0]]], [0.1, -0.1], atol=1e-6)
+
+
+def spread(apart=0.0, views=1.0, way=50.0, epoch=20.0) -> trust.MapSpread:
+    return trust.MapSpread(apart * jnp.eye(3), jnp.float32(views), jnp.float32(way), jnp.float32(epoch))
+
+
+@pytest.mark.parametrize("seen", [0.0, 20.0, 20.0 + 0.9 * trust._OTHER_EPOCH, 20.0 - 0.9 * trust._OTHER_EPOCH])
+def test_ground_of_the_same_epoch_or_of_none_errs_as_before(seen):
+    before, known = uncertain(), spread(1e-4)
+    after, still = revisit(before, known, jnp.float32(seen), PARAMS)
+    np.testing.assert_array_equal(after.cov, before.cov)
+    np.testing.assert_array_equal(after.mean, before.mean)
+    for a, b in zip(still, known, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("apart", [0.0, 1e-4])
+def test_ground_of_another_epoch_errs_the_more_differently_the_more_was_driven_in_between(apart):
+    before = uncertain()
+
+    def added(seen):
+        after, known = revisit(before, spread(apart), jnp.float32(seen), PARAMS)
+        assert float(known.epoch) == seen
+        np.testing.assert_array_equal(after.mean, before.mean)
+        return np.asarray(after.cov - before.cov, float)
+
+    near, far, ahead = added(10.0), added(5.0), added(35.0)
+    sigma = np.array([PARAMS.sigma_map, PARAMS.sigma_map, PARAMS.sigma_map_yaw])
+    want = np.zeros((SIZE, SIZE))
+    want[ERROR, ERROR] = 10.0 * (sigma**2 + apart / trust._PATCH_M)
+    np.testing.assert_allclose(near, want, atol=1e-7)  # float32
+    np.testing.assert_allclose(far, 1.5 * near, atol=1e-7)
+    np.testing.assert_array_equal(far, ahead)  # whichever was drawn first
+
+
+def test_ground_that_is_looked_at_on_and_on_is_another_only_once():
+    belief, known = revisit(uncertain(), spread(), jnp.float32(5.0), PARAMS)
+    again, _ = revisit(belief, known, jnp.float32(5.0), PARAMS)
+    np.testing.assert_array_equal(again.cov, belief.cov)
+
+
+def test_spread_is_the_mean_covariance_of_matches_where_new_ground_was_drawn():
+    known, covs, ways = trust.even_map(), [], [0.2, 0.3, 0.1]
+    C = np.asarray(layout.matched_pose_jacobian(NODES), float)
+    for seed, way in enumerate(ways):
+        belief = uncertain(seed)
+        covs.append(C @ np.asarray(belief.cov, float) @ C.T)
+        known = learn_spread(known, belief, jnp.eye(3), jnp.float32(way))
+        # old ground tells nothing, but the way to it counts
+        known = learn_spread(known, uncertain(9), jnp.zeros((3, 3)), jnp.float32(1.0))
+    np.testing.assert_allclose(known.apart, np.mean(covs, axis=0), atol=1e-6)  # float32
+    assert float(known.views) == pytest.approx(3.0)
+    assert float(known.way) == pytest.approx(float(trust.even_map().way) + sum(ways) + 3.0)
+    assert float(known.epoch) == float(trust.even_map().epoch)
+
+
+def test_half_a_view_of_new_ground_counts_half():
+    known = learn_spread(trust.even_map(), uncertain(0), jnp.eye(3), jnp.float32(0.0))
+    C = layout.matched_pose_jacobian(NODES)
+    first, second = (C @ uncertain(seed).cov @ C.T for seed in (0, 1))
+    known = learn_spread(known, uncertain(1), 0.5 * jnp.eye(3), jnp.float32(0.0))
+    np.testing.assert_allclose(known.apart, (2 * first + second) / 3, atol=1e-6)  # float32
