@@ -258,9 +258,7 @@ def test_gradient_of_one_filter_step_agrees_with_finite_differences(params, robu
         mean, root, distances, tunable = at
         changed = params._replace(**tunable)
         start = Gaussian(mean, root @ root.T)
-        predicted = motion.predict(
-            start, changed, jnp.array(0.1), none, jnp.zeros(NODES, bool), jnp.array(0.0), jnp.zeros(2)
-        )
+        predicted = motion.predict(start, changed, jnp.array(0.1), none, jnp.zeros(NODES, bool), jnp.zeros(2))
         after, used = update(predicted, ranges._replace(range=distances), ranges.valid, changed, robust=robust)
         return weights @ after.mean + weights @ after.cov @ weights + 0.1 * used.log_likelihood
 
