@@ -129,7 +129,7 @@ def share_of_walls(
     """
 
     def gram(beams):
-        normal = jnp.where((beams & surface.found)[:, None], surface.tangent, 0.0)[:, ::-1] * jnp.array([1.0, -1.0])
+        normal = jnp.where((beams & surface.found)[:, None], surface.tangent, 0.0)[:, ::-1] * jnp.array([[1.0, -1.0]])
         return normal.T @ normal
 
     R = rotation(heading)
