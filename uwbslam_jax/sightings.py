@@ -43,6 +43,8 @@ _RECENT_S = 1.0
 _CARRIED_SIGMA_M = 0.3
 _WALL_COST = 6.0
 """Log-likelihood that it costs to say that a wall has come between two nodes."""
+_WALL_M = 3.0
+"""No wall makes ranges too long by more than this, for long."""
 _SUPPORTS = 0.5
 """Share of `DECIDED` by which an explanation must still win without the node that speaks for it the loudest."""
 
@@ -228,6 +230,7 @@ def judge(sightings: Sightings, known: Known, slot: int, velocity: np.ndarray) -
     at, distance, time = anchors(rows, known), rows[:, DISTANCE], rows[:, TIME] - known.now
     sigma = np.sqrt(known.sigma(rows) ** 2 + known.variance[slot] + known.variance[rows[:, OTHER].astype(int)])
     here = known.places[slot] + time[:, None] * velocity
+    rests = not np.any(velocity)
     off = distance - np.linalg.norm(here - at, axis=1)
     bias = float(np.median(off)) if len(rows) else 0.0
     as_it_is = misfit(here, at, distance, sigma)
@@ -237,9 +240,8 @@ def judge(sightings: Sightings, known: Known, slot: int, velocity: np.ndarray) -
     spots = _moving_fits(rows, known, known.places[slot])
     best = [spot for spot in spots if spot.cost - spots[0].cost < DECIDED]
     spot = min(best, key=lambda s: float(np.linalg.norm(s.place - known.places[slot])))
-    moved = _unless_walled(as_it_is, off, rows) - misfit(
-        spot.place + time[:, None] * spot.velocity, at, distance, sigma
-    )
+    held = _unless_walled(as_it_is, off, rows) if rests else as_it_is
+    moved = held - misfit(spot.place + time[:, None] * spot.velocity, at, distance, sigma)
     several = len(np.unique(rows[:, OTHER])) > 1  # a second of ranges to one node leaves a motion open
     if several and _decides(moved, rows) and moved.sum() > biased.sum() + DECIDED:
         return Verdict(False, spot, rows, bias)
@@ -272,7 +274,7 @@ def _unless_walled(cost: np.ndarray, off: np.ndarray, rows: np.ndarray) -> np.nd
     cost = cost.copy()
     for other in np.unique(rows[:, OTHER]):
         mine = rows[:, OTHER] == other
-        if np.median(off[mine]) > 0:
+        if 0 < np.median(off[mine]) < _WALL_M:
             cost[mine] *= min(1.0, _WALL_COST / max(float(cost[mine].sum()), 1e-9))
     return cost
 
