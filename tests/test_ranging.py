@@ -30,9 +30,9 @@ predicted_ranges = jax.jit(ranging.predicted_ranges)
 @partial(jax.jit, static_argnames="robust")
 def update(belief, ranges, usable, params, *, robust):
     """The update between pairs that have been quiet so far."""
-    return ranging.update(
-        belief, ranges, usable, params, jax.tree.map(lambda x: x.astype(belief.mean.dtype), QUIET), robust=robust
-    )[:2]
+    dtype = belief.mean.dtype
+    scatter = QUIET._replace(log=QUIET.log.astype(dtype), last=QUIET.last.astype(dtype))
+    return ranging.update(belief, ranges, usable, params, scatter, robust=robust)[:2]
 
 
 POSITIONS = np.array([[0.5, -0.3], [4.0, 0.0], [-3.0, 3.0], [1.0, -5.0]])

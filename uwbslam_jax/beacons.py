@@ -142,7 +142,7 @@ class BeaconKeeper:
             i, j = np.asarray(r.i)[k], np.asarray(r.j)[k]
             age = np.asarray(r.age, float)[k]
             known = np.asarray(estimate.active) & ~np.asarray(estimate.moving)
-            antenna = _antenna(estimate, age, params)
+            antenna = antenna_at(estimate, age, params)
             columns = [now + age, i, *antenna.T, _flat(r, k, params), np.asarray(estimate.normalised, float)[k]]
             for node, other in ((i, j), (j, i)):
                 columns[OTHER] = other
@@ -273,7 +273,7 @@ class BeaconKeeper:
         return share, found[0] if np.mean(left < _MISFIT * self._sigma_n) > _FOUND_SHARE else None
 
 
-def _antenna(estimate: Estimate, age: np.ndarray, params: Params) -> np.ndarray:
+def antenna_at(estimate: Estimate, age: np.ndarray, params: Params) -> np.ndarray:
     """(R, 2) where the robot's antenna was at each exchange [m]."""
     pose = np.asarray(estimate.pose, float)
     heading = pose[2] + float(estimate.yaw_rate) * age

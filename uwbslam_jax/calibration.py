@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from uwbslam_jax.beacons import antenna_at
 from uwbslam_jax.config import Params
 from uwbslam_jax.measurements import StampedFrame
 from uwbslam_jax.multilateration import DECIDED, soften
@@ -44,7 +45,7 @@ class Solution(NamedTuple):
       slots: of the beacons. beacons: (B, 2) [m]; bias, bias_sigma: (1 + B,) of the robot's node and theirs, in
         addition to what is configured [m].
       cov: (2 B, 2 B) of the beacons, biases marginalised.
-      biased: whether biases explain the ranges far better than none.
+      biased: whether it has biases: they explain the ranges far better than none, or did so before.
       gain: log-likelihood gained over what is known now.
     """
 
@@ -91,7 +92,7 @@ class Calibration:
         """One frame's ranges that were used. loudness: (K, K) of the pairs, see ranging."""
         r = frame.frame.ranges
         resting = np.asarray(estimate.active) & ~np.asarray(estimate.moving)
-        pose, sigma = np.asarray(estimate.pose, float), float(np.trace(estimate.pose_cov[:2, :2])) / 2
+        sigma = float(np.trace(estimate.pose_cov[:2, :2])) / 2
         for k in np.flatnonzero(np.asarray(estimate.weight) > 0):
             i, j = sorted((int(r.i[k]), int(r.j[k])))
             if not (resting[j] and (i == 0 or resting[i])) or loudness[i, j] > _QUIET:
@@ -100,11 +101,7 @@ class Calibration:
             if i > 0:
                 _add(self._pairs[i, j], np.zeros(2), distance, 0.0)
                 continue
-            age = float(r.age[k])
-            heading = pose[2] + age * float(estimate.yaw_rate)
-            c, s = np.cos(heading), np.sin(heading)
-            x, y = np.asarray(params.antenna, float)
-            at = pose[:2] + age * np.asarray(estimate.velocity, float) + np.array([c * x - s * y, s * x + c * y])
+            at = antenna_at(estimate, np.asarray(r.age[k : k + 1], float), params)[0]
             key = int(at[0] // _PLACE_M), int(at[1] // _PLACE_M)
             _add(self._robot[j][key], at, distance, sigma)
 
@@ -128,7 +125,7 @@ class Calibration:
         m = 2 * len(slots)
         sigma = np.sqrt(np.diag(cov)[m:])
         gain = problem.cost(start, BIAS_M if found else CALIBRATED_M) - cost
-        return Solution(slots, x[:m].reshape(-1, 2), x[m:], sigma, cov[:m, :m], better, gain)
+        return Solution(slots, x[:m].reshape(-1, 2), x[m:], sigma, cov[:m, :m], better or bool(found), gain)
 
     def _rows(self, slots: list[int], configured: Params) -> _Problem:
         index = {slot: b for b, slot in enumerate(slots)}

@@ -80,16 +80,19 @@ class Scatter(NamedTuple):
 
     Attributes:
       log: (K, K) log of how many times as much its innovations jump from one range to the next as its noise lets them.
-      last: (K, K) the last innovation over its standard deviation, NaN before there was one.
+      last: (K, K) the last innovation over its standard deviation.
+      heard: (K, K) whether there was one.
     """
 
     log: Float[Array, "K K"]
     last: Float[Array, "K K"]
+    heard: Bool[Array, "K K"]
 
 
 def quiet(nodes: int) -> Scatter:
     """Scatter before anything was heard."""
-    return Scatter(jnp.zeros((nodes, nodes), jnp.float32), jnp.full((nodes, nodes), jnp.nan, jnp.float32))
+    # an array of its own for each: the step donates its state, and no buffer can be donated twice
+    return Scatter(*(jnp.zeros((nodes, nodes), dtype) for dtype in (jnp.float32, jnp.float32, bool)))
 
 
 def loudness(log: Float[Array, "*m"]) -> Float[Array, "*m"]:
@@ -113,9 +116,8 @@ def learn_scatter(scatter: Scatter, ranges: Ranges, usable: Bool[Array, "M"], no
     Args:
       normalised: innovations over their standard deviation for quiet pairs.
     """
-    before = scatter.last[ranges.i, ranges.j]
-    jump = (normalised - before) / jnp.sqrt(2.0)
-    known = usable & jnp.isfinite(before)
+    jump = (normalised - scatter.last[ranges.i, ranges.j]) / jnp.sqrt(2.0)
+    known = usable & scatter.heard[ranges.i, ranges.j]
     median = _NORMAL_MEDIAN * jnp.exp(scatter.log[ranges.i, ranges.j])
     square = jnp.where(known, jump / median, 1.0) ** 2
     move = jnp.where(known, _LEARN * (1.0 - 2.0 / (1.0 + square**2)), 0.0)
@@ -123,7 +125,8 @@ def learn_scatter(scatter: Scatter, ranges: Ranges, usable: Bool[Array, "M"], no
     # a slot without a range must not overwrite a pair that has one
     i, j = (jnp.where(usable, slot, scatter.log.shape[0]) for slot in (ranges.i, ranges.j))
     last = scatter.last.at[i, j].set(normalised, mode="drop").at[j, i].set(normalised, mode="drop")
-    return Scatter(jnp.clip(log, *_SCATTER_LIMITS), last)
+    heard = scatter.heard.at[i, j].set(True, mode="drop").at[j, i].set(True, mode="drop")
+    return Scatter(jnp.clip(log, *_SCATTER_LIMITS), last, heard)
 
 
 def update(

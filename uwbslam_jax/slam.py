@@ -181,7 +181,7 @@ class _Matched(NamedTuple):
 def _match_and_fuse(config, params, state, belief, frame, sweep, usable) -> tuple[Gaussian, _Matched]:
     """Preset "robust": align the scan fully, search where that fails, fuse what it is worth (DESIGN 1.8, 1.9)."""
     match, searched = _match(config, params, state, belief, sweep, frame.has_scan)
-    seen = jnp.where(frame.has_scan & _ranged(state), _epoch_seen(config, state.grid, sweep, match.pose), 0.0)
+    seen = jnp.where(frame.has_scan & _map_errs(config, state), _epoch_seen(config, state.grid, sweep, match.pose), 0.0)
     belief, spread = trust.revisit(belief, state.map_spread, seen, params)
     lost = (match.known > _KNOWN_ENOUGH) & (match.score < _LOST_SCORE)
     lost = lost | (searched & (match.known < _FOUND_KNOWN))
@@ -292,7 +292,7 @@ def _draw(config, state, matched: _Matched, sweep) -> tuple[State, Bool[Array, "
     way = jnp.where(wanted, safe_norm(pose[:2] - state.drawn_pose[:2]), 0.0)
     share = jnp.zeros((3, 3)).at[2, 2].set(novelty)
     share = share.at[:2, :2].set(matching.share_of_walls(matching.surface(sweep), new, sweep.valid, pose[2]))
-    share = jnp.where(wanted & _ranged(state), share, 0.0)
+    share = jnp.where(wanted & _map_errs(config, state), share, 0.0)
     state = state._replace(
         belief=trust.anchor(state.belief, at, share),
         map_spread=trust.learn_spread(state.map_spread, state.belief, share, way),
@@ -303,9 +303,10 @@ def _draw(config, state, matched: _Matched, sweep) -> tuple[State, Bool[Array, "
     return state, wanted
 
 
-def _ranged(state):
-    """Whether ranges can tell the pose from the map. On LiDAR alone the map is the measure, and has no error."""
-    return jnp.any(state.active[1:])
+def _map_errs(config, state):
+    """Whether ranges can tell the pose from the map. On LiDAR alone the map is the measure, and has no error; the paper
+    knows of none."""
+    return jnp.any(state.active[1:]) & (config.preset == "robust")
 
 
 def _epoch_seen(config, grid, sweep, pose):

@@ -130,9 +130,9 @@ def anchor(belief: Gaussian, at: Float[Array, "3"], share: Float[Array, "3 3"]) 
     apart = at - belief.mean[pose]
     apart = apart.at[2].set(wrap_angle(apart[2]))
     mean = belief.mean.at[error].add(share @ (apart - belief.mean[error]))
-    F = jnp.eye(belief.mean.shape[0])
-    F = F.at[error[:, None], error].add(-share).at[error[:, None], pose].add(-share)
-    return Gaussian(mean, F @ belief.cov @ F.T)
+    # only the map error's rows and columns change: cheaper than the dense F P F^T
+    rows = belief.cov.at[error].add(-share @ (belief.cov[error] + belief.cov[pose]))
+    return Gaussian(mean, rows.at[:, error].add(-(rows[:, error] + rows[:, pose]) @ share.T))
 
 
 def learn_spread(spread: MapSpread, belief: Gaussian, share: Float[Array, "3 3"], way: Float[Array, ""]) -> MapSpread:
