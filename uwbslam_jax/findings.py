@@ -64,13 +64,16 @@ def to_result(session: Session, facts: Facts) -> Result:
     tracks: dict[int, list[tuple[float, float, float, float]]] = {}
     for t, slot, x, y, sigma in history.tracks:
         tracks.setdefault(ids[slot], []).append(((t - start) / 1e9, x, y, sigma))
+    online = np.array(history.poses, float).reshape(-1, 3)
+    track = online if session.hindsight is None else session.hindsight.track
     diagnostics = {name: np.array(values)[at] for name, values in history.diagnostics.items()}
     if len(facts.step_ms) == len(history.stamps):
         diagnostics["step_ms"] = np.array(facts.step_ms, float)[at]
     return Result(
         stamps=stamps,
-        poses=np.array(history.poses, float).reshape(-1, 3)[at],
-        pose_covs=np.array(history.covs, float).reshape(-1, 3, 3)[at],
+        poses=track[at],
+        online=online[at],
+        online_covs=np.array(history.covs, float).reshape(-1, 3, 3)[at],
         beacons=_beacons(session, ids) if facts.relative is None else _relative_beacons(session, facts.relative),
         beacon_tracks={node: np.array(rows, float) for node, rows in tracks.items()},
         map=session.tiles.image(session.state.grid),
@@ -93,13 +96,21 @@ def _biases(session: Session) -> list[str]:
 
 
 def _beacons(session: Session, ids: dict[int, int]) -> list[BeaconEstimate]:
-    """Beacons in the state as they are in it now, those that left it as they were last reported."""
+    """Beacons as the whole run tells them where they rest, else as they are in the state, or were last reported."""
+    told = {}
+    if session.hindsight is not None:
+        solution = session.hindsight.solution
+        for b, node in enumerate(solution.nodes):
+            block = slice(3 + 2 * b, 5 + 2 * b)
+            told[node] = solution.beacons[b], solution.cov[block, block]
     active = np.asarray(session.state.active)
     mean, cov = np.asarray(session.state.belief.mean, float), np.asarray(session.state.belief.cov, float)
     found = []
     for slot in range(1, len(active)):
         status = session.beacon_status(slot)
-        if active[slot]:
+        if session.graph.node(slot) in told and status != "moving":
+            found.append(BeaconEstimate(ids[slot], *told[session.graph.node(slot)], status))
+        elif active[slot]:
             two = slice(2 * slot, 2 * slot + 2)
             found.append(BeaconEstimate(ids[slot], mean[two], cov[two, two], status))
         elif slot in session.history.beacons:
@@ -147,7 +158,8 @@ def _scan_points(session: Session) -> np.ndarray:
     reach, age = np.asarray(scan.ranges, float)[beam], float(scan.time_increment) * beam
     x, y = lidar[0] + reach * np.cos(bearing), lidar[1] + reach * np.sin(bearing)
     # the estimate may be older than the published frame: its velocity counts relative to its own heading
-    pose, velocity = session.history.poses[number], np.asarray(estimate.velocity, float)
+    track = session.history.poses if session.hindsight is None else session.hindsight.track
+    pose, velocity = track[number], np.asarray(estimate.velocity, float)
     turned = pose[2] - float(estimate.pose[2])
     c, s = np.cos(turned), np.sin(turned)
     drift = np.array([c * velocity[0] - s * velocity[1], s * velocity[0] + c * velocity[1]])

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from uwbslam_jax.graph import map_pose, sight
 from uwbslam_jax.measurements import StampedFrame
 from uwbslam_jax.slam import Estimate
 from uwbslam_jax.startup import Adopted
@@ -19,7 +20,8 @@ class History:
     """Poses, covariances and diagnostics of every frame since the first scan, beacons once a second, events.
 
     Attributes:
-      stamps, poses, covs: one entry a frame; decided: whether the published frame was known then.
+      stamps, poses, covs: one entry a frame, what was published.
+      map_poses, sight: one entry a frame, see graph: where the map has the robot, and what the match could not see.
       diagnostics: one entry a frame by name.
       residuals: (t, slot, slot, measured minus predicted); tracks: (t, slot, x, y, sigma).
       events: (stamp, text).
@@ -30,6 +32,8 @@ class History:
     def __init__(self) -> None:
         self.stamps: list[int] = []
         self.poses: list[np.ndarray] = []
+        self.map_poses: list[np.ndarray] = []
+        self.sight: list[float] = []
         self.covs: list[np.ndarray] = []
         self.has_scan: list[bool] = []
         self.diagnostics: dict[str, list[float]] = {}
@@ -44,6 +48,8 @@ class History:
         """Take in one step."""
         self.stamps.append(frame.stamp)
         self.poses.append(np.asarray(estimate.pose, float))
+        self.map_poses.append(map_pose(estimate))
+        self.sight.append(sight(estimate))
         self.covs.append(np.asarray(estimate.pose_cov))
         self.has_scan.append(bool(frame.frame.has_scan))
         r = frame.frame.ranges
@@ -84,9 +90,12 @@ class History:
 
     def republish(self, adopted: Adopted) -> None:
         """The frame was decided: what was reported in the start frame is put into the published one."""
-        poses = adopted.republish(np.array(self.stamps), np.array(self.poses))
+        stamps = np.array(self.stamps)
+        poses = adopted.republish(stamps, np.array(self.poses))
+        self.map_poses = list(adopted.republish(stamps, np.array(self.map_poses)))
         turn = adopted.after[-1, 2] - adopted.before[-1, 2]
         c, s = np.cos(turn), np.sin(turn)
         R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
         self.poses = list(poses)
+        self.sight = [angle + turn for angle in self.sight]
         self.covs = [R @ P @ R.T for P in self.covs]

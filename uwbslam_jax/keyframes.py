@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uwbslam_jax.measurements import Ranges, StampedFrame
+from uwbslam_jax.measurements import Ranges, Snapshot, StampedFrame
 from uwbslam_jax.multilateration import RANGE_FLOOR_M
 
 _MOVED = (0.25, 0.2)
@@ -51,6 +51,11 @@ class Keyframe:
     velocity: np.ndarray
     yaw_rate: float
     odometry: bool = False
+
+    def snapshot(self) -> Snapshot:
+        """Its scan and how the robot moved."""
+        drift = turned(-self.pose[2], self.velocity).astype(np.float32)
+        return Snapshot(self.frame.frame.scan, drift, np.float32(self.yaw_rate))
 
     @property
     def blind(self) -> bool:

@@ -101,6 +101,19 @@ class Scan(NamedTuple):
     time_increment: Float[Leaf, ""]
 
 
+class Snapshot(NamedTuple):
+    """A scan and how the robot moved while it was taken.
+
+    Attributes:
+      scan: see there.
+      drift: velocity in the robot's own frame [m/s]; yaw_rate [rad/s].
+    """
+
+    scan: Scan
+    drift: Float[Leaf, "2"]
+    yaw_rate: Float[Leaf, ""]
+
+
 class Ranges(NamedTuple):
     """All exchanges of one frame, padded. M = config.max_ranges; slots index nodes, 0 is the robot.
 

@@ -303,7 +303,7 @@ def _position_at(history: Float[np.ndarray, "n 3"], stamp: int) -> Float[np.ndar
 
 
 def consistency(result: Result, truth: Truth) -> dict[str, float]:
-    """NEES over degrees of freedom of a run: pose_nees_ratio of the robot's poses since the frame was decided,
+    """NEES over degrees of freedom of a run: pose_nees_ratio of the robot's poses as published since the frame was decided,
     beacon_nees_ratio of the beacons' last positions. NaN where the truth does not know the frame's beacons.
 
     The truth is put into the published frame by its own two beacons and not by a fit: a fit would take out the very
@@ -315,13 +315,13 @@ def consistency(result: Result, truth: Truth) -> dict[str, float]:
         return figures
     decided = int(result.stamps[0]) + round(result.summary["decided_at"] * 1e9)
     into = published_frame(truth, frame[0], frame[1], decided)
-    known = (result.stamps >= decided) & np.isfinite(result.poses).all(axis=1)
+    known = (result.stamps >= decided) & np.isfinite(result.online).all(axis=1)
     if known.any():
         true = truth.poses_at(result.stamps[known])
         xy = (true[:, :2] - into.translation) @ into.rotation
-        errors = result.poses[known] - np.column_stack([xy, true[:, 2] - into.angle])
+        errors = result.online[known] - np.column_stack([xy, true[:, 2] - into.angle])
         errors[:, 2] = wrap(errors[:, 2])
-        figures["pose_nees_ratio"] = nees(errors, result.pose_covs[known]).ratio
+        figures["pose_nees_ratio"] = nees(errors, result.online_covs[known]).ratio
     last = truth.beacon_positions()
     total, dof = 0.0, 0
     for beacon in result.beacons:

@@ -61,7 +61,7 @@ def page_data(result: Result) -> dict[str, Any]:
     """All that report.js draws."""
     seconds = (result.stamps - result.stamps[0]) / 1e9 if len(result.stamps) else np.zeros(0)
     pick = np.unique(np.linspace(0, max(len(seconds) - 1, 0), _POSES).astype(int)) if len(seconds) else slice(0)
-    poses, covs = result.poses[pick], result.pose_covs[pick]
+    poses, covs = result.poses[pick], result.online_covs[pick]
     track = {"t": _numbers(seconds[pick], 3)}
     track |= {name: _numbers(poses[:, k], 3) for k, name in enumerate(("x", "y", "yaw"))}
     track |= {"xx": _numbers(covs[:, 0, 0], 6), "xy": _numbers(covs[:, 0, 1], 6), "yy": _numbers(covs[:, 1, 1], 6)}

@@ -48,8 +48,9 @@ class Result:
 
     Attributes:
       stamps: (T,) int64 [ns].
-      poses: (T, 3) x, y, yaw [m, m, rad].
-      pose_covs: (T, 3, 3) [m, m, rad].
+      poses: (T, 3) x, y, yaw as the whole run tells them [m, m, rad].
+      online: (T, 3) as they were published along the way; those from before the frame was decided were filled in then.
+      online_covs: (T, 3, 3) of these [m, m, rad].
       beacons: last estimate of every beacon ever placed.
       beacon_tracks: id -> (n, 4) of t [s since stamps[0]], x, y, sigma [m], thinned; for plots.
       map: the occupancy map.
@@ -62,7 +63,8 @@ class Result:
 
     stamps: np.ndarray
     poses: np.ndarray
-    pose_covs: np.ndarray
+    online: np.ndarray
+    online_covs: np.ndarray
     beacons: list[BeaconEstimate]
     beacon_tracks: dict[int, np.ndarray]
     map: MapImage

@@ -90,8 +90,8 @@ def _packed(message: Any) -> tuple[str, bytes]:
 
 def _poses(result: Result, known: np.ndarray) -> Iterator[_Item]:
     for index in known:
-        stamp, (x, y, yaw) = int(result.stamps[index]), result.poses[index].tolist()
-        yield _Item(stamp, "/pose", partial(_pose, stamp, x, y, yaw, result.pose_covs[index]))
+        stamp, (x, y, yaw) = int(result.stamps[index]), result.online[index].tolist()
+        yield _Item(stamp, "/pose", partial(_pose, stamp, x, y, yaw, result.online_covs[index]))
         yield _Item(stamp, "/tf", partial(_robot_transform, stamp, x, y, yaw))
 
 

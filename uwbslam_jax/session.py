@@ -21,11 +21,15 @@ from uwbslam_jax import beacon_state, layout, ranging, slam, startup
 from uwbslam_jax.beacons import BeaconKeeper
 from uwbslam_jax.calibration import Calibration
 from uwbslam_jax.config import Params, Settings, make_config, make_params
+from uwbslam_jax.graph import Graph
+from uwbslam_jax.hindsight import Hindsight, look_back
 from uwbslam_jax.history import History
 from uwbslam_jax.keyframes import Buffer
 from uwbslam_jax.measurements import Frame, StampedFrame
 from uwbslam_jax.multilateration import DECIDED
+from uwbslam_jax.redraw import redraw
 from uwbslam_jax.slam import Estimate, State
+from uwbslam_jax.smoothing import Node
 from uwbslam_jax.tiles import Tiles
 
 CONTROL_EVERY = 10
@@ -94,6 +98,10 @@ class Session:
         self._keeper = BeaconKeeper(settings)
         self._calibration = Calibration(settings.uwb.sigma_n)
         self._calibrated_at = 0
+        self.graph = Graph(settings.uwb.sigma_n)
+        self.hindsight: Hindsight | None = None
+        self._places: dict[Node, np.ndarray] = {}
+        self._frame_nodes: tuple[Node, Node] = ((0, 0), (0, 0))
 
     @property
     def slots(self) -> dict[int, int]:
@@ -129,6 +137,27 @@ class Session:
         """The last look, over the frames since the one before."""
         if self._pending:
             self._look()
+        self.hindsight = self._look_back()
+        if self.hindsight is None:
+            return
+        solution = self.hindsight.solution
+        if solution.biased:
+            self.found_bias = solution.bias
+        seen = [(pose, key.snapshot()) for pose, key in zip(solution.poses, self.graph.keyframes, strict=True) if key.tied]
+        robot = self.hindsight.track[-1, :2]
+        self.state = self.state._replace(grid=redraw(self.config, self.params, self.tiles, seen, robot))
+
+    def _look_back(self) -> Hindsight | None:
+        """What the run so far tells as a whole."""
+        if self.decided_at is None:
+            return None
+        positions = np.asarray(layout.unpack(self.state.belief.mean).positions, float)
+        resting = np.asarray(self.state.active) & ~np.asarray(self.state.moving)
+        places = self._places | {self.graph.node(slot): positions[slot] for slot in np.flatnonzero(resting) if slot > 0}
+        configured = make_params(self.settings, self._slots)
+        return look_back(
+            self.graph, self.history, places, configured, self._frame_nodes, biased=bool(self.found_bias)
+        )
 
     def _learn_slots(self, frame: StampedFrame) -> None:
         if len(frame.slots) > len(self._slots):
@@ -156,6 +185,9 @@ class Session:
 
     def _look(self) -> None:
         pending, self._pending = self._pending, []
+        first = len(self.history.stamps) - len(pending)
+        numbered = [(first + k, frame, estimate) for k, (frame, estimate) in enumerate(pending)]
+        self.graph.add(self.config, self.params, numbered, placed=self.decided_at is not None)
         if not self.settings.filter.lidar_only:
             if self.decided_at is None:
                 self._start_up(pending)
@@ -185,11 +217,19 @@ class Session:
             nodes = [0, *outcome.placement.slots]
             self.found_bias = dict(zip(nodes, map(float, outcome.placement.bias), strict=True))
             self.params = self._biased(make_params(self.settings, self._slots))
-        adopted = startup.adopt(self.config, self.params, self.state, self._buffer, outcome.placement, (origin, along))
+        adopted = startup.adopt(
+            self.config, self.params, self.state, self.tiles, self._buffer, outcome.placement, (origin, along)
+        )
         self.state, self.decided_at, self._calibrated_at = adopted.state, now, now
         self.config = make_config(self.settings)
-        self.tiles.clear()
+        self._frame_nodes = self.graph.node(origin), self.graph.node(along)
         self.history.republish(adopted)
+        self.graph.put(
+            adopted.republish(
+                np.array([key.stamp for key in self.graph.keyframes]), np.array([key.pose for key in self.graph.keyframes])
+            ),
+            adopted.after[-1, 2] - adopted.before[-1, 2],
+        )
         self.history.event(now, f"frame decided by beacons {ids[origin]} and {ids[along]}")
         for slot in outcome.placement.slots:
             self._keeper.placed(slot, now)
@@ -204,6 +244,10 @@ class Session:
             self.history.event(pending[-1][0].stamp, f"{who} {text}")
             if slot > 0:
                 self._calibration.forget(slot)
+            if slot == 0 or any(word in text for word in ("placed", "carried", "put down", "was moved")):
+                if slot in self.history.beacons:
+                    self._places[self.graph.node(slot)] = np.asarray(self.history.beacons[slot][0], float)
+                self.graph.moved(slot)
         loudness = np.asarray(ranging.loudness(self.state.scatter.log))
         for frame, estimate in pending:
             self._calibration.hear(frame, estimate, self.params, loudness)

@@ -82,6 +82,7 @@ class Estimate(NamedTuple):
       velocity: (2,) [m/s]; yaw_rate [rad/s].
       beacons, beacon_covs: (K, 2), (K, 2, 2) [m]; slot 0 is the robot.
       active, moving: (K,).
+      map_error: (3,) of the map where the robot is [m, m, rad].
       matched_pose: (3,) what the match reported, before the map's own error is taken off.
       information: (3, 3) what the match told about it [1/m^2 ...]; 0 where it told nothing.
       score, known: of the match, see Match.
@@ -98,6 +99,7 @@ class Estimate(NamedTuple):
     beacon_covs: Float[Array, "K 2 2"]
     active: Bool[Array, "K"]
     moving: Bool[Array, "K"]
+    map_error: Float[Array, "3"]
     matched_pose: Float[Array, "3"]
     information: Float[Array, "3 3"]
     score: Float[Array, ""]
@@ -336,6 +338,7 @@ def _report(state, matched: _Matched, used, drawn) -> Estimate:
         beacon_covs=blocks[node, :, node, :],
         active=state.active,
         moving=state.moving,
+        map_error=s.map_error,
         matched_pose=matched.match.pose,
         information=matched.information,
         score=matched.match.score,

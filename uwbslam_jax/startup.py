@@ -10,21 +10,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from uwbslam_jax import grid as occupancy
-from uwbslam_jax import layout, slam
+from uwbslam_jax import layout
 from uwbslam_jax.config import Config, Params
 from uwbslam_jax.ekf import Gaussian
 from uwbslam_jax.hypotheses import explanations
-from uwbslam_jax.keyframes import Buffer, Keyframe
-from uwbslam_jax.measurements import Ranges, Scan
+from uwbslam_jax.keyframes import Buffer
+from uwbslam_jax.measurements import Ranges
 from uwbslam_jax.multilateration import DECIDED, SIGMA_ENOUGH_M
 from uwbslam_jax.placement import CALIBRATED_M, Placement, Problem, largest_sigma, rotation
+from uwbslam_jax.redraw import redraw
 from uwbslam_jax.slam import State
-from uwbslam_jax.tiles import TILE
+from uwbslam_jax.tiles import Tiles
 
 _MOVED_ENOUGH_M = 1.0
 _BIAS_M = 0.3
@@ -109,7 +108,7 @@ def _keep_certain(placement: Placement, ids: dict[int, int], *, drawn: bool) -> 
         sigma_enough, heading_enough = max(sigma_enough, _UNDRAWN_SIGMA * span), _UNDRAWN_HEADING
     onward = np.zeros(3)
     x, cov = _last_and_beacons(placement)
-    J = _numeric_jacobian(partial(_published, slots=placement.slots, frame_slots=frame_slots, onward=onward), x)
+    J = numeric_jacobian(partial(published, slots=placement.slots, frame_slots=frame_slots, onward=onward), x)
     cov = J @ cov @ J.T
     if np.sqrt(cov[2, 2]) > heading_enough or largest_sigma(cov[:2, :2])[0] > sigma_enough:
         return None
@@ -161,6 +160,7 @@ def adopt(
     config: Config,
     params: Params,
     state: State,
+    tiles: Tiles,
     buffer: Buffer,
     placement: Placement,
     frame_slots: tuple[int, int],
@@ -168,7 +168,7 @@ def adopt(
     """The state in the paper's frame (one beacon at the origin, another on +x), its covariance carried along.
 
     Args:
-      state: of the LiDAR-only run in the start frame.
+      state: of the LiDAR-only run in the start frame; tiles: what of its map lies outside the window.
       frame_slots: slots of the two beacons that make the frame.
     """
     keys = buffer.track()
@@ -176,14 +176,15 @@ def adopt(
     pose = np.asarray(layout.robot_pose(state.belief.mean), float)
     onward = between(before[-1], pose)
     x, cov = _last_and_beacons(placement)
-    y = partial(_published, slots=placement.slots, frame_slots=frame_slots, onward=onward)
-    J = _numeric_jacobian(y, x)
+    y = partial(published, slots=placement.slots, frame_slots=frame_slots, onward=onward)
+    J = numeric_jacobian(y, x)
     cov = J @ cov @ J.T
-    motion = _frame_motion(placement.beacons, placement.slots, frame_slots)
+    motion = frame_motion(placement.beacons, placement.slots, frame_slots)
     after = compose(motion, placement.poses)
     belief = _belief(state.belief, config.nodes, y(x), cov, placement.slots, pose)
     active = jnp.zeros(config.nodes, bool).at[jnp.array([0, *placement.slots])].set(True)
-    grid = _redraw(config, params, keys, after, y(x)[:2])
+    seen = [(pose, key.snapshot()) for pose, key in zip(after, keys, strict=True) if bool(key.frame.frame.has_scan)]
+    grid = redraw(config, params, tiles, seen, y(x)[:2])
     adopted = state._replace(
         belief=belief,
         active=active,
@@ -196,21 +197,21 @@ def adopt(
     return Adopted(adopted, np.array([key.frame.stamp for key in keys]), before, after)
 
 
-def _frame_motion(beacons: np.ndarray, slots: list[int], frame_slots: tuple[int, int]) -> np.ndarray:
+def frame_motion(beacons: np.ndarray, slots: list[int], frame_slots: tuple[int, int]) -> np.ndarray:
     origin, along = (beacons[slots.index(s)] for s in frame_slots)
     theta = -np.arctan2(along[1] - origin[1], along[0] - origin[0])
     return np.append(-rotation(theta) @ origin, theta)
 
 
-def _published(x: np.ndarray, *, slots, frame_slots, onward) -> np.ndarray:
+def published(x: np.ndarray, *, slots, frame_slots, onward) -> np.ndarray:
     """Robot pose now and beacons in the published frame, from the last keyframe and beacons in the start frame."""
     beacons = x[3:].reshape(-1, 2)
-    motion = _frame_motion(beacons, slots, frame_slots)
+    motion = frame_motion(beacons, slots, frame_slots)
     robot = compose(motion, compose(x[:3], onward))
     return np.concatenate([robot, (beacons @ rotation(motion[2]).T + motion[:2]).ravel()])
 
 
-def _numeric_jacobian(function, x: np.ndarray) -> np.ndarray:
+def numeric_jacobian(function, x: np.ndarray) -> np.ndarray:
     h = 1e-6
     columns = [(function(x + h * e) - function(x - h * e)) / (2 * h) for e in np.eye(len(x))]
     return np.stack(columns, axis=1)
@@ -244,33 +245,6 @@ def _belief(
     P[np.ix_(error, error)] = cov[:3, :3]
     mean[pose], mean[placed], mean[error] = values[:3], values[3:], 0.0
     return Gaussian(jnp.asarray(mean, jnp.float32), jnp.asarray(P, jnp.float32))
-
-
-def _redraw(config: Config, params: Params, keys: list[Keyframe], poses: np.ndarray, middle: np.ndarray):
-    """A fresh window over the robot with every keyframe's scan drawn at its pose."""
-    grid = occupancy.empty(config.cells, config.levels, config.resolution)
-    side = TILE * config.resolution
-    corner = np.round((middle - config.cells * config.resolution / 2) / side) * side
-    grid = grid._replace(origin=jnp.asarray(corner, jnp.float32))
-    for key, pose in zip(keys, poses, strict=True):
-        if bool(key.frame.frame.has_scan):
-            drift = jnp.asarray(rotation(-key.pose[2]) @ key.velocity, jnp.float32)
-            grid = _draw_one(
-                config,
-                params,
-                grid,
-                jnp.asarray(pose, jnp.float32),
-                key.frame.frame.scan,
-                drift,
-                np.float32(key.yaw_rate),
-            )
-    return grid
-
-
-@partial(jax.jit, static_argnums=0)
-def _draw_one(config: Config, params: Params, grid: occupancy.Grid, pose, scan: Scan, drift, yaw_rate):
-    sweep = slam.undo_motion(scan, params.lidar, drift, yaw_rate)
-    return occupancy.integrate(grid, pose, sweep, config.resolution)
 
 
 def compose(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -1,0 +1,39 @@
+"""The map drawn again from scans at poses that are known better now."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from uwbslam_jax import grid as occupancy
+from uwbslam_jax import slam
+from uwbslam_jax.config import Config, Params
+from uwbslam_jax.grid import Grid
+from uwbslam_jax.measurements import Snapshot
+from uwbslam_jax.tiles import Tiles
+
+
+def redraw(
+    config: Config, params: Params, tiles: Tiles, seen: Iterable[tuple[np.ndarray, Snapshot]], robot: np.ndarray
+) -> Grid:
+    """A fresh map of scans (pose (3,) [m, m, rad], snapshot), in their order; its window is over the robot (2,) [m] at
+    the end, what lies outside it in the tiles."""
+    tiles.clear()
+    grid = tiles.recentre(occupancy.empty(config.cells, config.levels, config.resolution), robot)
+    for pose, snapshot in seen:
+        if tiles.needs_move(np.asarray(grid.origin, float), config.cells, pose[:2]):
+            grid = tiles.recentre(grid, pose[:2])
+        grid = _draw(config, params, grid, np.float32(pose), snapshot)
+    if tiles.needs_move(np.asarray(grid.origin, float), config.cells, robot):
+        grid = tiles.recentre(grid, robot)
+    return grid
+
+
+@partial(jax.jit, static_argnums=0, donate_argnums=2)
+def _draw(config: Config, params: Params, grid: Grid, pose, snapshot: Snapshot) -> Grid:
+    sweep = slam.undo_motion(snapshot.scan, params.lidar, snapshot.drift, snapshot.yaw_rate)
+    return occupancy.integrate(grid, jnp.asarray(pose), sweep, config.resolution)
