@@ -79,12 +79,13 @@ def measure(scenario: Scenario) -> Outcome:
     apart = disturbed(scenario)
     beacons = {beacon.id: beacon.position for beacon in result.beacons}
     motion = align(*_undisturbed(result, apart), beacons, truth)
-    trial = lay_over(result, truth, motion, messages.memory)
+    stamps, _ = _undisturbed(result, apart)
+    calm = np.isin(result.stamps, stamps)
+    trial = lay_over(result, truth, align(stamps, result.online[calm], {}, truth), messages.memory)
     whole = dataclasses.replace(trial, poses=motion.poses(result.poses))
     of_all = evaluate(result.stamps, result.poses, beacons, truth)
     true = truth.beacon_positions()
     off = [np.linalg.norm(motion.points(xy[None])[0] - true[node]) for node, xy in beacons.items() if node in true]
-    calm = ~trial.within(apart)
     turned = np.abs(wrap(whole.poses[calm, 2] - whole.true[calm, 2]))
     figures: dict[str, Any] = {key: of_all[key] for key in ("covered", "beacons_missing")}
     figures |= {

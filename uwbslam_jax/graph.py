@@ -7,7 +7,7 @@ measures is the pose relative to those: that is a loop closed, without any searc
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import jax
@@ -55,7 +55,6 @@ class Keyframe:
       drift: (2,) velocity in the robot's frame [m/s]; yaw_rate [rad/s].
       wheels: (3,) motion since the keyframe before by odometry, None where it was not measured all the way.
       broken: whether the robot was carried on the way from the keyframe before.
-      tied: whether its scan was laid over another one: then it may be drawn.
     """
 
     stamp: int
@@ -67,7 +66,6 @@ class Keyframe:
     yaw_rate: float
     wheels: np.ndarray | None
     broken: bool
-    tied: bool = False
 
     def snapshot(self) -> Snapshot:
         """Its scan as it was."""
@@ -145,9 +143,32 @@ class Graph:
     _broken: bool = False
     _anchors: list[int] = field(default_factory=list)
 
+    def copy(self) -> Graph:
+        """What there is now; what is added later does not change it."""
+        pairs = {pair: deque(kept) for pair, kept in self.pairs.items()}
+        return Graph(self.sigma_n, list(self.keyframes), list(self.edges), list(self.means), pairs)
+
+    def poses(self) -> np.ndarray:
+        """(N, 3) where the map has the keyframes [m, m, rad]."""
+        return np.array([key.pose for key in self.keyframes]).reshape(-1, 3)
+
+    def stamps(self) -> np.ndarray:
+        """(N,) of the keyframes [ns]."""
+        return np.array([key.stamp for key in self.keyframes], np.int64)
+
+    def seen(self, poses: np.ndarray, first: int = 0) -> list[tuple[np.ndarray, Snapshot]]:
+        """What may be drawn, from a first keyframe on: the scans that were laid over others, at poses (N, 3)."""
+        tied = {edge.old for edge in self.edges} | {edge.new for edge in self.edges}
+        return [(poses[k], self.keyframes[k].snapshot()) for k in sorted(tied) if k >= first]
+
     def node(self, slot: int) -> tuple[int, int]:
         """The place where a beacon rests now."""
         return slot, self._rests.get(slot, 0)
+
+    def placed(self, slot: int, since: int) -> None:
+        """A beacon was found to rest where it was ranged from a time on [ns]; where it was before, nobody knows."""
+        node = self.node(slot)
+        self.means = [m for m in self.means if m.node != node or self.keyframes[m.at].stamp >= since]
 
     def moved(self, slot: int) -> None:
         """A beacon is, or the robot (slot 0) was, somewhere else from now on."""
@@ -161,18 +182,15 @@ class Graph:
         config: Config,
         params: Params,
         seen: list[tuple[int, StampedFrame, Estimate]],
-        *,
-        placed: bool,
     ) -> None:
         """Take in a few frames.
 
         Args:
           seen: number in the history, frame and estimate.
-          placed: whether the beacons are in the state; ranges then count while theirs are at rest.
         """
         for number, frame, estimate in seen:
             pose = map_pose(estimate)
-            self._hear(frame, estimate, pose, params, config.nlos_gap_db, placed)
+            self._hear(frame, estimate, pose, params, config.nlos_gap_db)
             self._roll(frame)
             informed = np.asarray(estimate.information, float)
             if self.keyframes and not self._far(pose, frame.stamp, informed):
@@ -212,12 +230,11 @@ class Graph:
                 self._wheels[:2] + turned(self._wheels[2], step[:2]), self._wheels[2] + step[2]
             )
 
-    def _hear(self, frame, estimate, pose, params, gap, placed) -> None:
+    def _hear(self, frame, estimate, pose, params, gap) -> None:
         r = frame.frame.ranges
         usable = np.asarray(r.valid) & ~(np.asarray(r.power_gap) > gap)
-        if placed:
-            resting = np.asarray(estimate.active) & ~np.asarray(estimate.moving)
-            usable &= resting[r.i] & resting[r.j]
+        moving = np.asarray(estimate.moving)
+        usable &= ~(moving[r.i] | moving[r.j])
         lever = np.asarray(params.antenna, float)
         motion = np.append(np.asarray(estimate.velocity, float), float(estimate.yaw_rate))
         for k in np.flatnonzero(usable):
@@ -277,8 +294,11 @@ class Graph:
         """The map was drawn again: keyframes so far are at poses (N, 3) in it, turned by an angle [rad]."""
         R = np.eye(3)
         R[:2, :2] = np.array(rotation(turn))
-        for key, pose in zip(self.keyframes, poses, strict=True):
-            key.pose, key.informed = pose, R @ key.informed @ R.T
+        # new ones, not changed ones: a copy keeps what it has
+        self.keyframes = [
+            replace(key, pose=pose, informed=R @ key.informed @ R.T)
+            for key, pose in zip(self.keyframes, poses, strict=True)
+        ]
 
     def _tie(self, params: Params) -> None:
         """Edges from the newest keyframe to older ones whose scans it can be laid over."""
@@ -303,8 +323,8 @@ class Graph:
         for k, target in enumerate(old):
             off = np.abs(found.pose[k] - guess[k])
             if found.share[k] > _SHARE and np.all(off < _BELIEVED):
-                key.tied = self.keyframes[target].tied = True
-                self.edges.append(Edge(target, new, np.asarray(found.pose[k], float), np.asarray(found.information[k], float)))
+                pose, information = (np.asarray(a[k], float) for a in (found.pose, found.information))
+                self.edges.append(Edge(target, new, pose, information))
 
 
 def map_pose(estimate: Estimate) -> np.ndarray:

@@ -17,6 +17,25 @@ from uwbslam_jax.keyframes import turned
 from uwbslam_jax.smoothing import Node, Solution, solve
 from uwbslam_jax.startup import compose, frame_motion, numeric_jacobian, published
 
+class Question(NamedTuple):
+    """What a solution of the run so far starts from.
+
+    Attributes:
+      graph: what was collected. poses: (N, 3) of its keyframes to start from [m, m, rad].
+      places: resting place of a beacon -> where it is, about (2,) [m].
+      params: with the heights and biases that the user configured.
+      frame_nodes: the resting places that make the published frame: its origin, and +x.
+      biased: whether ranges were found to be biased before.
+    """
+
+    graph: Graph
+    poses: np.ndarray
+    places: dict[Node, np.ndarray]
+    params: Params
+    frame_nodes: tuple[Node, Node]
+    biased: bool
+
+
 class Hindsight(NamedTuple):
     """The run solved as a whole, in the published frame.
 
@@ -29,30 +48,18 @@ class Hindsight(NamedTuple):
     track: np.ndarray
 
 
-def look_back(
-    graph: Graph,
-    history: History,
-    places: dict[Node, np.ndarray],
-    params: Params,
-    frame_nodes: tuple[Node, Node],
-    *,
-    biased: bool,
-) -> Hindsight | None:
-    """The run so far solved as a whole; None where it has too little of it.
+def look_back(question: Question, history: History) -> Hindsight | None:
+    """The run so far solved as a whole; None where it has too little of it."""
+    solution = framed_solution(question)
+    return None if solution is None else Hindsight(solution, _track(question.graph, history, solution.poses))
 
-    Args:
-      places: resting place of a beacon -> where it is, about (2,) [m].
-      params: with the heights and biases that the user configured.
-      frame_nodes: the resting places that make the published frame: its origin, and +x.
-      biased: whether ranges were found to be biased before.
-    """
-    poses = np.array([history.poses[key.frame] for key in graph.keyframes]).reshape(-1, 3)
+
+def framed_solution(question: Question) -> Solution | None:
+    """The solution, and its covariance, in the published frame."""
+    graph, poses, places, params, frame_nodes, biased = question
     height, bias = np.asarray(params.height, float), np.asarray(params.bias, float)
     solution = solve(graph, poses, places, height, bias, float(params.bias_scale), biased=biased)
-    if solution is None:
-        return None
-    solution = _framed(solution, poses, frame_nodes)
-    return Hindsight(solution, _track(graph, history, solution.poses))
+    return None if solution is None else _framed(solution, poses, frame_nodes)
 
 
 def _framed(solution: Solution, before: np.ndarray, frame_nodes: tuple[Node, Node]) -> Solution:

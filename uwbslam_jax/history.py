@@ -10,7 +10,7 @@ import numpy as np
 from uwbslam_jax.graph import map_pose, sight
 from uwbslam_jax.measurements import StampedFrame
 from uwbslam_jax.slam import Estimate
-from uwbslam_jax.startup import Adopted
+from uwbslam_jax.startup import Adopted, carried_along
 
 _RESIDUALS_EVERY_S = 0.5
 _TRACK_EVERY_S = 1.0
@@ -88,12 +88,16 @@ class History:
         """Something worth telling happened."""
         self.events.append((stamp, text))
 
+    def carry_along(self, anchors: np.ndarray, before: np.ndarray, after: np.ndarray) -> None:
+        """The map was corrected: its keyframes (N,) [ns] moved from before (N, 3) to after. What was published stays."""
+        self.map_poses = list(carried_along(np.array(self.stamps), np.array(self.map_poses), anchors, before, after))
+
     def republish(self, adopted: Adopted) -> None:
         """The frame was decided: what was reported in the start frame is put into the published one."""
         stamps = np.array(self.stamps)
         poses = adopted.republish(stamps, np.array(self.poses))
         self.map_poses = list(adopted.republish(stamps, np.array(self.map_poses)))
-        turn = adopted.after[-1, 2] - adopted.before[-1, 2]
+        turn = adopted.turn
         c, s = np.cos(turn), np.sin(turn)
         R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
         self.poses = list(poses)

@@ -17,31 +17,25 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from uwbslam_jax import beacon_state, layout, ranging, slam, startup
+from uwbslam_jax import layout, slam, startup
 from uwbslam_jax.beacons import BeaconKeeper
-from uwbslam_jax.calibration import Calibration
 from uwbslam_jax.config import Params, Settings, make_config, make_params
 from uwbslam_jax.graph import Graph
-from uwbslam_jax.hindsight import Hindsight, look_back
+from uwbslam_jax.hindsight import Hindsight, Question, look_back
 from uwbslam_jax.history import History
 from uwbslam_jax.keyframes import Buffer
 from uwbslam_jax.measurements import Frame, StampedFrame
-from uwbslam_jax.multilateration import DECIDED
 from uwbslam_jax.redraw import redraw
+from uwbslam_jax.revision import Reviser, is_news, take_over
+from uwbslam_jax.sightings import MEMORY_S
 from uwbslam_jax.slam import Estimate, State
-from uwbslam_jax.smoothing import Node
+from uwbslam_jax.smoothing import Node, Solution
 from uwbslam_jax.tiles import Tiles
 
 CONTROL_EVERY = 10
 """Frames between two looks of the host."""
 _SOLVE_EVERY_S = 1.0
 """The start-up problem is solved at most this often, in the log's time."""
-
-_CALIBRATE_EVERY_S = 5.0
-"""Biases are looked for this often, in the log's time."""
-_NEWS = 3.0
-"""What the whole run tells is taken over when it explains the ranges better by so many times what decides: its poses
-are not independent of each other, though they are taken to be."""
 
 TRACES: Counter[str] = Counter()
 """How often each compiled function was traced, by name; a test counts them."""
@@ -96,10 +90,10 @@ class Session:
         self._solved_at = self._solved_with = 0
         self._buffer = self._new_buffer()
         self._keeper = BeaconKeeper(settings)
-        self._calibration = Calibration(settings.uwb.sigma_n)
-        self._calibrated_at = 0
         self.graph = Graph(settings.uwb.sigma_n)
         self.hindsight: Hindsight | None = None
+        self._looks_back = settings.filter.preset == "robust" and not settings.filter.lidar_only
+        self._reviser = Reviser()
         self._places: dict[Node, np.ndarray] = {}
         self._frame_nodes: tuple[Node, Node] = ((0, 0), (0, 0))
 
@@ -137,27 +131,26 @@ class Session:
         """The last look, over the frames since the one before."""
         if self._pending:
             self._look()
-        self.hindsight = self._look_back()
+        self._reviser.close()
+        question = self._question()
+        self.hindsight = None if question is None else look_back(question, self.history)
         if self.hindsight is None:
             return
-        solution = self.hindsight.solution
-        if solution.biased:
-            self.found_bias = solution.bias
-        seen = [(pose, key.snapshot()) for pose, key in zip(solution.poses, self.graph.keyframes, strict=True) if key.tied]
+        self._learn_biases(self.hindsight.solution, self.history.stamps[-1])
+        seen = self.graph.seen(self.hindsight.solution.poses)
         robot = self.hindsight.track[-1, :2]
         self.state = self.state._replace(grid=redraw(self.config, self.params, self.tiles, seen, robot))
 
-    def _look_back(self) -> Hindsight | None:
-        """What the run so far tells as a whole."""
-        if self.decided_at is None:
+    def _question(self) -> Question | None:
+        """What to solve of the run so far."""
+        if self.decided_at is None or not self._looks_back:
             return None
         positions = np.asarray(layout.unpack(self.state.belief.mean).positions, float)
         resting = np.asarray(self.state.active) & ~np.asarray(self.state.moving)
         places = self._places | {self.graph.node(slot): positions[slot] for slot in np.flatnonzero(resting) if slot > 0}
+        poses = np.array([self.history.poses[key.frame] for key in self.graph.keyframes]).reshape(-1, 3)
         configured = make_params(self.settings, self._slots)
-        return look_back(
-            self.graph, self.history, places, configured, self._frame_nodes, biased=bool(self.found_bias)
-        )
+        return Question(self.graph.copy(), poses, places, configured, self._frame_nodes, bool(self.found_bias))
 
     def _learn_slots(self, frame: StampedFrame) -> None:
         if len(frame.slots) > len(self._slots):
@@ -187,7 +180,8 @@ class Session:
         pending, self._pending = self._pending, []
         first = len(self.history.stamps) - len(pending)
         numbered = [(first + k, frame, estimate) for k, (frame, estimate) in enumerate(pending)]
-        self.graph.add(self.config, self.params, numbered, placed=self.decided_at is not None)
+        if self._looks_back:
+            self.graph.add(self.config, self.params, numbered)
         if not self.settings.filter.lidar_only:
             if self.decided_at is None:
                 self._start_up(pending)
@@ -220,16 +214,11 @@ class Session:
         adopted = startup.adopt(
             self.config, self.params, self.state, self.tiles, self._buffer, outcome.placement, (origin, along)
         )
-        self.state, self.decided_at, self._calibrated_at = adopted.state, now, now
+        self.state, self.decided_at = adopted.state, now
         self.config = make_config(self.settings)
         self._frame_nodes = self.graph.node(origin), self.graph.node(along)
         self.history.republish(adopted)
-        self.graph.put(
-            adopted.republish(
-                np.array([key.stamp for key in self.graph.keyframes]), np.array([key.pose for key in self.graph.keyframes])
-            ),
-            adopted.after[-1, 2] - adopted.before[-1, 2],
-        )
+        self.graph.put(adopted.republish(self.graph.stamps(), self.graph.poses()), adopted.turn)
         self.history.event(now, f"frame decided by beacons {ids[origin]} and {ids[along]}")
         for slot in outcome.placement.slots:
             self._keeper.placed(slot, now)
@@ -242,35 +231,46 @@ class Session:
         for slot, text in events:
             who = "robot" if slot == 0 else f"beacon {ids[slot]}"
             self.history.event(pending[-1][0].stamp, f"{who} {text}")
-            if slot > 0:
-                self._calibration.forget(slot)
-            if slot == 0 or any(word in text for word in ("placed", "carried", "put down", "was moved")):
-                if slot in self.history.beacons:
-                    self._places[self.graph.node(slot)] = np.asarray(self.history.beacons[slot][0], float)
-                self.graph.moved(slot)
-        loudness = np.asarray(ranging.loudness(self.state.scatter.log))
-        for frame, estimate in pending:
-            self._calibration.hear(frame, estimate, self.params, loudness)
-        now = pending[-1][0].stamp
-        if now - self._calibrated_at > _CALIBRATE_EVERY_S * 1e9:
-            self._calibrated_at = now
-            self._calibrate(now)
+            self._remember(slot, text, pending[-1][0].stamp)
+        if any(slot == 0 for slot, _ in events):
+            self._reviser.drop()
+        self._revise(pending[-1][0].stamp)
 
-    def _calibrate(self, now: int) -> None:
-        """Take over what the whole run tells of the beacons and their biases, where the state's contradict it."""
-        configured = make_params(self.settings, self._slots)
-        places = np.asarray(layout.unpack(self.state.belief.mean).positions, float)
-        solution = self._calibration.solve(places, self.found_bias, configured)
-        if solution is None or not solution.known or solution.gain < _NEWS * DECIDED:
+    def _remember(self, slot: int, text: str, now: int) -> None:
+        """What an event means for the run as a whole."""
+        if text == "placed":
+            self.graph.placed(slot, now - round(MEMORY_S * 1e9))
+        elif slot == 0 or any(word in text for word in ("carried", "put down", "was moved", "dropped")):
+            if slot in self.history.beacons:
+                self._places[self.graph.node(slot)] = np.asarray(self.history.beacons[slot][0], float)
+            self.graph.moved(slot)
+
+    def _revise(self, now: int) -> None:
+        """Take over what the run so far tells, where the state contradicts it; begin to ask again."""
+        revision = self._reviser.look()
+        if revision is not None and (is_news(revision, self.state, self.graph) or self._learns(revision.solution)):
+            self._learn_biases(revision.solution, now)
+            anchors, before = self.graph.stamps(), self.graph.poses()
+            self.state = take_over(self.config, self.params, revision, self.state, self.graph)
+            self.tiles = revision.tiles
+            self.history.carry_along(anchors, before, self.graph.poses())
+            self.history.event(now, "beacons and map corrected by the run so far")
+        if self._looks_back and self._reviser.wants(len(self.graph.keyframes)):
+            question = self._question()
+            if question is not None:
+                epoch = float(self.state.map_spread.way)
+                self._reviser.begin(self.config, self.params, question, self.settings.map.resolution, epoch)
+
+    def _learns(self, solution: Solution) -> bool:
+        return solution.biased and not self.found_bias
+
+    def _learn_biases(self, solution: Solution, now: int) -> None:
+        if not solution.biased:
             return
-        if solution.biased:
-            if not self.found_bias:
-                self.history.event(now, "ranges are biased: biases and beacons solved from the run so far")
-            self.found_bias |= dict(zip([0, *solution.slots], map(float, solution.bias), strict=True))
-            self.params = self._biased(configured)
-        else:
-            self.history.event(now, "beacons solved from the run so far")
-        self.state = beacon_state.put_beacons(self.state, solution.slots, solution.beacons, solution.cov)
+        if not self.found_bias:
+            self.history.event(now, "ranges are biased: biases and beacons solved from the run so far")
+        self.found_bias = solution.bias
+        self.params = self._biased(make_params(self.settings, self._slots))
 
     def beacon_status(self, slot: int) -> str:
         """static, moving, silent, dropped or waiting."""

@@ -22,9 +22,10 @@ CALIBRATED_M = 1e-3
 """Standard deviation of a node's bias when ranges are taken to be calibrated [m]."""
 BIAS_M = 0.3
 """Prior spread of a node's bias once they are not [m]."""
-_SOFT_EDGE = (1000.0, 30.0, 5.0)
-"""Whitened length of an edge's residual from which on it counts less (Geman-McClure), one solution after the other: the
-filter's track may be far off for what two scans tell, and an edge must not be an outlier only because of that."""
+_STAGES = ((1000.0, 4.0), (30.0, 2.0), (5.0, 1.0))
+"""One solution after the other: whitened length of an edge's residual from which on it counts less (Geman-McClure), and
+how many times as much a range may err. The filter's track may be far off for what two scans tell, and nothing must be an
+outlier only because the start is wrong."""
 _LOOSE_WHEELS = (0.03, 0.06, 0.02, 0.06)
 """Standard deviation of a step by wheels: floor and share of the way [m], floor and share of the turn [rad]."""
 _LOOSE = (0.1, 0.2, 0.05, 0.1)
@@ -185,19 +186,19 @@ class _Problem:
 
     def minimise(self, x: np.ndarray, bias_sigma: float) -> tuple[np.ndarray, float]:
         """Levenberg-Marquardt from x: unknowns and cost."""
-        for soft in _SOFT_EDGE:
-            x, cost = self._descend(x, bias_sigma, soft)
+        for stage in _STAGES:
+            x, cost = self._descend(x, bias_sigma, stage)
         return x, cost
 
-    def _descend(self, x: np.ndarray, bias_sigma: float, soft: float) -> tuple[np.ndarray, float]:
+    def _descend(self, x: np.ndarray, bias_sigma: float, stage: tuple[float, float]) -> tuple[np.ndarray, float]:
         held = x[:3].copy()
-        J, r = self._linearise(x, held, bias_sigma, soft)
+        J, r = self._linearise(x, held, bias_sigma, stage)
         cost, damping = 0.5 * r @ r, 1e-6
         for _ in range(_MOVES):
             A = (J.T @ J).tocsc()
             step = _factor(A + damping * sparse.diags(A.diagonal() + 1e-9, format="csc")).solve(J.T @ r)
             moved = x - step
-            new_J, new_r = self._linearise(moved, held, bias_sigma, soft)
+            new_J, new_r = self._linearise(moved, held, bias_sigma, stage)
             new_cost = 0.5 * new_r @ new_r
             if new_cost < cost:
                 gain, x, J, r, cost = cost - new_cost, moved, new_J, new_r, new_cost
@@ -212,7 +213,7 @@ class _Problem:
 
     def solution(self, x: np.ndarray, cost: float, bias_sigma: float, biased: bool) -> Solution:
         n, m = 3 * self.count, 3 * self.count + 2 * len(self.nodes)
-        J, _ = self._linearise(x, x[:3], bias_sigma, _SOFT_EDGE[-1])
+        J, _ = self._linearise(x, x[:3], bias_sigma, _STAGES[-1])
         columns = np.arange(n - 3, self.size)
         unit = np.zeros((self.size, len(columns)))
         unit[columns, np.arange(len(columns))] = 1.0
@@ -230,15 +231,15 @@ class _Problem:
             cov[: m - n + 3, : m - n + 3],
         )
 
-    def _linearise(self, x, held, bias_sigma, soft) -> tuple[sparse.csr_matrix, np.ndarray]:
+    def _linearise(self, x, held, bias_sigma, stage) -> tuple[sparse.csr_matrix, np.ndarray]:
         """Whitened Jacobian and residuals of held start, edges, steady velocity, ranges, pairs and biases."""
         rows = _Rows(self.size)
         poses = x[: 3 * self.count].reshape(-1, 3)
         rows.add((x[:3] - held)[:, None] / _HELD, [(np.arange(3), np.full(3, 1 / _HELD))])
-        self._edge_rows(rows, poses, soft)
+        self._edge_rows(rows, poses, stage[0])
         self._steady_rows(rows, poses)
-        self._range_rows(rows, x, poses)
-        self._pair_rows(rows, x)
+        self._range_rows(rows, x, poses, stage[1])
+        self._pair_rows(rows, x, stage[1])
         m = self.size - len(self.slots)
         rows.add(x[m:] / bias_sigma, [(np.arange(m, self.size), np.full(len(self.slots), 1 / bias_sigma))])
         return rows.matrix(), rows.residuals()
@@ -285,7 +286,7 @@ class _Problem:
                 parts += [(3 * k + other, -pull), (3 * (k - 1) + other, pull)]
             rows.add(r, parts)
 
-    def _range_rows(self, rows: _Rows, x, poses) -> None:
+    def _range_rows(self, rows: _Rows, x, poses, coarse: float) -> None:
         n = 3 * self.count
         beacons = x[n : n + 2 * len(self.nodes)].reshape(-1, 2)
         ends = [poses[k, :2] + turned(poses[k, 2], lever) for k, lever in ((self.at, self.before), (self.at + 1, self.after))]
@@ -294,8 +295,9 @@ class _Problem:
         d = np.maximum(np.sqrt((u**2).sum(1) + self.rise**2), 1e-6)
         column = self._bias_column(self.to)
         robot = self.size - len(self.slots)
-        r, scale = soften((d + x[robot] + x[column] - self.distance) / self.sigma)
-        weight = scale / self.sigma
+        sigma = coarse * self.sigma
+        r, scale = soften((d + x[robot] + x[column] - self.distance) / sigma)
+        weight = scale / sigma
         unit = u / d[:, None]
         parts = []
         for key, end, part in ((self.at, ends[0], 1 - self.share), (self.at + 1, ends[1], self.share)):
@@ -306,13 +308,14 @@ class _Problem:
         parts += [(np.full(len(d), robot), weight), (column, weight)]
         rows.add(r, parts)
 
-    def _pair_rows(self, rows: _Rows, x) -> None:
+    def _pair_rows(self, rows: _Rows, x, coarse: float) -> None:
         if not len(self.pair):
             return
         n = 3 * self.count
         beacons = x[n : n + 2 * len(self.nodes)].reshape(-1, 2)
         i, j = self.pair.T
         distance, rise, sigma = self.pair_numbers.T
+        sigma = coarse * sigma
         u = beacons[i] - beacons[j]
         d = np.maximum(np.sqrt((u**2).sum(1) + rise**2), 1e-6)
         first, second = self._bias_column(i), self._bias_column(j)

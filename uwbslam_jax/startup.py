@@ -7,6 +7,7 @@ While the step runs on LiDAR (and odometry) alone, a `Buffer` keeps keyframes an
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -147,13 +148,26 @@ class Adopted:
 
     def republish(self, stamps: np.ndarray, poses: np.ndarray) -> np.ndarray:
         """Poses (T, 3) of the start frame, taken at stamps (T,) [ns], in the published frame."""
-        last = len(self.anchors) - 1
-        at = np.clip(np.searchsorted(self.anchors, stamps, side="right") - 1, 0, last)
-        after = np.minimum(at + 1, last)
-        span = np.maximum(self.anchors[after] - self.anchors[at], 1)
-        share = np.clip((stamps - self.anchors[at]) / span, 0.0, 1.0)[:, None]
-        ends = [compose(self.after[k], between(self.before[k], poses)) for k in (at, after)]
-        return (1 - share) * ends[0] + share * ends[1]
+        return carried_along(stamps, poses, self.anchors, self.before, self.after)
+
+    @property
+    def turn(self) -> float:
+        """Of the published frame against the start frame [rad]."""
+        return float(self.after[-1, 2] - self.before[-1, 2])
+
+
+def carried_along(
+    stamps: np.ndarray, poses: np.ndarray, anchors: np.ndarray, before: np.ndarray, after: np.ndarray
+) -> np.ndarray:
+    """Poses (T, 3) taken at stamps (T,) [ns] of a track whose keyframes, at anchors (N,) [ns], have moved from before
+    (N, 3) to after (N, 3): each with the keyframes before and after it."""
+    last = len(anchors) - 1
+    at = np.clip(np.searchsorted(anchors, stamps, side="right") - 1, 0, last)
+    next_one = np.minimum(at + 1, last)
+    span = np.maximum(anchors[next_one] - anchors[at], 1)
+    share = np.clip((stamps - anchors[at]) / span, 0.0, 1.0)[:, None]
+    ends = [compose(after[k], between(before[k], poses)) for k in (at, next_one)]
+    return (1 - share) * ends[0] + share * ends[1]
 
 
 def adopt(
@@ -181,7 +195,7 @@ def adopt(
     cov = J @ cov @ J.T
     motion = frame_motion(placement.beacons, placement.slots, frame_slots)
     after = compose(motion, placement.poses)
-    belief = _belief(state.belief, config.nodes, y(x), cov, placement.slots, pose)
+    belief = anchored(state.belief, config.nodes, y(x), cov, placement.slots, pose)
     active = jnp.zeros(config.nodes, bool).at[jnp.array([0, *placement.slots])].set(True)
     seen = [(pose, key.snapshot()) for pose, key in zip(after, keys, strict=True) if bool(key.frame.frame.has_scan)]
     grid = redraw(config, params, tiles, seen, y(x)[:2])
@@ -217,13 +231,22 @@ def numeric_jacobian(function, x: np.ndarray) -> np.ndarray:
     return np.stack(columns, axis=1)
 
 
-def _belief(
-    belief: Gaussian, nodes: int, values: np.ndarray, cov: np.ndarray, slots: list[int], old_pose: np.ndarray
+def anchored(
+    belief: Gaussian,
+    nodes: int,
+    values: np.ndarray,
+    cov: np.ndarray,
+    slots: list[int],
+    old_pose: np.ndarray,
+    apart: Sequence[int] = (),
 ) -> Gaussian:
-    """State vector and covariance from robot pose and beacons; velocities turn with the frame.
+    """State vector and covariance from robot pose and beacons (3 + 2 B,); velocities turn with the frame.
 
     The map is drawn at the estimated poses, so its error is that of the pose with the other sign: a match then
     reports what the track already says, and only the ranges can tell the two apart.
+
+    Args:
+      slots: of the beacons; old_pose: (3,) of the robot in the belief. apart: slots that are to stay as they are.
     """
     mean, P = np.array(belief.mean, float), np.array(belief.cov, float)
     pose, error = np.array(layout.pose_indices(nodes)), np.array(layout.map_error_indices(nodes))
@@ -235,9 +258,13 @@ def _belief(
     motion_cov = P[np.ix_(moving, moving)]
     motion_cov[:2] = R @ motion_cov[:2]
     motion_cov[:, :2] = motion_cov[:, :2] @ R.T
+    own = P
     P = np.eye(len(mean))
     P[beacon_velocities, beacon_velocities] = 1e-8
     P[np.ix_(moving, moving)] = motion_cov
+    for slot in apart:  # what is not among the beacons keeps what is known of it by itself
+        rows = np.array([2 * slot, 2 * slot + 1, 2 * (nodes + slot), 2 * (nodes + slot) + 1])
+        P[np.ix_(rows, rows)] = own[np.ix_(rows, rows)]
     known = np.concatenate([pose, placed])
     P[np.ix_(known, known)] = cov
     P[np.ix_(error, known)] = -cov[:3]

@@ -1,0 +1,172 @@
+"""The state corrected by the run so far, while the run goes on: solved and drawn beside it, taken over when it is news.
+
+A revision is begun at one look of the host and taken over a fixed number of looks later, whether it was ready long
+before or has to be waited for: so a run and its re-run stay the same to the bit.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from uwbslam_jax import layout
+from uwbslam_jax.config import Config, Params
+from uwbslam_jax.graph import Graph, Keyframe, relative, wrapped
+from uwbslam_jax.grid import Grid
+from uwbslam_jax.hindsight import Question, framed_solution
+from uwbslam_jax.multilateration import SIGMA_ENOUGH_M
+from uwbslam_jax.placement import largest_sigma
+from uwbslam_jax.redraw import draw_onto, redraw
+from uwbslam_jax.slam import State
+from uwbslam_jax.smoothing import Solution
+from uwbslam_jax.startup import anchored, compose
+from uwbslam_jax.tiles import Tiles
+
+_LOOKS = 10
+"""Looks of the host from the beginning of a revision to its taking over."""
+_GROWTH = 1.25
+"""A revision is begun when the graph has grown by so much since the last one."""
+_FEWEST = 24
+"""Keyframes of the first one."""
+_NEWS = 9.0
+"""Squared Mahalanobis distance of a beacon from where the state has it, beyond which that is wrong."""
+_NEWS_M = 0.03
+"""Whatever the state believes: a beacon or a keyframe that is off by less is no news [m]."""
+_WALK = (0.004, 0.004, 0.0006)
+"""Standard deviation of what the pose drifts on the way since the last keyframe that was solved [m, m, rad / m^0.5]."""
+_FLOOR_M = 0.01
+"""No beacon is known better by a map that has cells [m]."""
+
+
+class Revision(NamedTuple):
+    """The run until some keyframe, solved and drawn: keyframes (N,), their poses, the map."""
+
+    keyframes: list[Keyframe]
+    solution: Solution
+    grid: Grid
+    tiles: Tiles
+
+
+def revise(config: Config, params: Params, question: Question, resolution: float, epoch: float) -> Revision | None:
+    """Solves and draws. epoch: of the ground that is drawn, see grid [m]."""
+    solution = framed_solution(question)
+    if solution is None:
+        return None
+    tiles = Tiles(resolution)
+    seen = question.graph.seen(solution.poses)
+    grid = redraw(config, params, tiles, seen, solution.poses[-1, :2], epoch)
+    return Revision(question.graph.keyframes, solution, grid, tiles)
+
+
+@dataclass
+class Reviser:
+    """Begins revisions and hands them over when they are due."""
+
+    _pool: ThreadPoolExecutor | None = None
+    _running: Future[Revision | None] | None = None
+    _due: int = 0
+    _begun_with: int = 0
+
+    def wants(self, keyframes: int) -> bool:
+        """Whether another one should be begun."""
+        return self._running is None and keyframes >= max(_FEWEST, _GROWTH * self._begun_with)
+
+    def begin(self, config: Config, params: Params, question: Question, resolution: float, epoch: float) -> None:
+        """Begins one from what was collected so far."""
+        self._pool = self._pool or ThreadPoolExecutor(1, thread_name_prefix="revision")
+        self._begun_with, self._due = len(question.graph.keyframes), _LOOKS
+        self._running = self._pool.submit(revise, config, params, question, resolution, epoch)
+
+    def look(self) -> Revision | None:
+        """The revision that is due at this look of the host; waited for if need be."""
+        if self._running is None:
+            return None
+        self._due -= 1
+        if self._due > 0:
+            return None
+        running, self._running = self._running, None
+        return running.result()
+
+    def drop(self) -> None:
+        """What is being solved is no longer what happened; its end is waited for."""
+        if self._running is not None:
+            self._running.result()
+            self._running = None
+
+    def close(self) -> None:
+        """No more revisions."""
+        self.drop()
+        if self._pool is not None:
+            self._pool.shutdown()
+            self._pool = None
+
+
+def is_news(revision: Revision, state: State, graph: Graph) -> bool:
+    """Whether a revision contradicts the state: a beacon stands elsewhere, or the map was drawn elsewhere."""
+    solution = revision.solution
+    slots, places, at = _current(solution, graph)
+    if len(slots) < 2:
+        return False
+    mean, P = np.asarray(state.belief.mean, float), np.asarray(state.belief.cov, float)
+    for slot, place, b in zip(slots, places, at, strict=True):
+        two, own = slice(2 * slot, 2 * slot + 2), slice(3 + 2 * b, 5 + 2 * b)
+        off = place - mean[two]
+        if np.linalg.norm(off) > _NEWS_M and off @ np.linalg.solve(P[two, two] + solution.cov[own, own], off) > _NEWS:
+            return True
+    drawn = np.array([key.pose for key in graph.keyframes[: len(solution.poses)]])
+    off = np.linalg.norm(solution.poses[:, :2] - drawn[:, :2], axis=1)
+    return bool(np.sqrt(np.mean(off**2)) > _NEWS_M)
+
+
+def take_over(config: Config, params: Params, revision: Revision, state: State, graph: Graph) -> State:
+    """The state with pose, beacons and map as a revision has them, carried on to now; the graph's keyframes are moved
+    with the map."""
+    solution, count = revision.solution, len(revision.keyframes)
+    slots, places, at = _current(solution, graph)
+    onward = relative(graph.keyframes[count - 1].pose, graph.poses())
+    poses = np.concatenate([solution.poses, compose(solution.poses[-1], onward[count:])])
+    grid = revision.grid
+    way = float(state.map_spread.way)
+    for pose, snapshot in graph.seen(poses, count):
+        grid = draw_onto(config, params, revision.tiles, grid, pose, snapshot, way)
+    s = layout.unpack(state.belief.mean)
+    old = np.asarray(layout.robot_pose(state.belief.mean), float)
+    on_map = old + np.asarray(s.map_error, float)
+    pose = compose(solution.poses[-1], relative(graph.keyframes[count - 1].pose, on_map))
+    pose[2] = old[2] + wrapped(pose[2] - old[2])
+    cov = _cov(solution, at, pose, float(np.sum(np.hypot(*np.diff(poses[count - 1 :, :2], axis=0).T))))
+    others = [slot for slot in np.flatnonzero(np.asarray(state.active)) if slot > 0 and slot not in slots]
+    values = np.concatenate([pose, places.ravel()])
+    belief = anchored(state.belief, config.nodes, values, cov, slots, old, others)
+    # a buffer of its own: the step donates its state
+    spread = state.map_spread._replace(epoch=state.map_spread.way + 0.0)
+    graph.put(poses, 0.0)
+    return state._replace(
+        belief=belief,
+        grid=grid,
+        map_spread=spread,
+        drawn_pose=jnp.asarray(pose, jnp.float32),
+    )
+
+
+def _current(solution: Solution, graph: Graph) -> tuple[list[int], np.ndarray, list[int]]:
+    """Slots of the beacons that still rest where the solution has them, their places (B, 2), their numbers in it."""
+    sigma = largest_sigma(solution.cov[3:, 3:])
+    at = [b for b, node in enumerate(solution.nodes) if graph.node(node[0]) == node and sigma[b] < SIGMA_ENOUGH_M]
+    return [solution.nodes[b][0] for b in at], solution.beacons[at], at
+
+
+def _cov(solution: Solution, at: list[int], pose: np.ndarray, way: float) -> np.ndarray:
+    """(3 + 2 B,) square covariance of the robot's pose now and some of the beacons."""
+    rows = np.concatenate([np.arange(3), *[3 + 2 * b + np.arange(2) for b in at]]).astype(int)
+    cov = solution.cov[np.ix_(rows, rows)]
+    # how the last solved pose turns, the robot turns around it
+    lever = pose[:2] - solution.poses[-1, :2]
+    J = np.eye(len(rows))
+    J[0, 2], J[1, 2] = -lever[1], lever[0]
+    floor = np.concatenate([np.array(_WALK) ** 2 * way + np.array(_WALK) ** 2, np.full(2 * len(at), _FLOOR_M**2)])
+    return J @ cov @ J.T + np.diag(floor)
