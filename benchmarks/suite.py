@@ -20,11 +20,13 @@ class Check:
       name: of the figure, with its unit.
       limit: the figure has to stay at or below it.
       measure: figure of a trial and its scenario.
+      online: whether what was published at the time is judged, or the track as the whole run tells it.
     """
 
     name: str
     limit: float
     measure: Callable[[Trial, Scenario], float]
+    online: bool = True
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,9 @@ COVERED = 0.98
 STRAY = 0.03
 """Share of the map's occupied cells that may lie apart from every wall: more is a doubled wall."""
 
-_LENGTH = Check("length error [m]", 0.10, lambda trial, made: checks.length_error(trial, intervals.stops(made)))
+_LENGTH = Check(
+    "length error [m]", 0.10, lambda trial, made: checks.length_error(trial, intervals.stops(made)), online=False
+)
 
 ROWS: dict[str, Row] = {
     "hall": Row("hall, laps in both directions, ids in any order", 0.015, 0.015, 0.1),
@@ -97,13 +101,13 @@ ROWS: dict[str, Row] = {
         checks=(
             Check("told too early", 0.0, lambda t, made: checks.told_too_early(t, intervals.first_turn(made))),
             Check("decided late [s]", 3.0, lambda t, made: checks.decided_late(t, intervals.first_turn(made))),
-            Check("filled in [m]", 0.05, lambda trial, _: checks.filled_in(trial)),
+            Check("filled in [m]", 0.05, lambda trial, _: checks.filled_in(trial), online=False),
         ),
     ),
     "blind": Row(
         "LiDAR blinded for 5 s",
         0.03,
-        checks=(Check("while blind [m]", 0.10, lambda t, made: checks.rms_within(t, made.lidar.blind)),),
+        checks=(Check("while blind [m]", 0.10, lambda t, made: checks.rms_within(t, made.lidar.blind), online=False),),
     ),
     "uwb_silent": Row("UWB silent for 30 s", 0.03),
     "kidnapped": Row(
@@ -115,6 +119,7 @@ ROWS: dict[str, Row] = {
                 "afterwards [m]",
                 0.03,
                 lambda t, made: checks.rms_within(t, [(intervals.disturbed(made)[-1][1], math.inf)]),
+                online=False,
             ),
         ),
     ),

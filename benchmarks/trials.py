@@ -32,7 +32,8 @@ class Outcome:
     Attributes:
       result, truth: of the run.
       motion: from the published frame into the truth's, fitted where the robot is not disturbed.
-      trial: what the checks judge.
+      trial: what was published at the time; whole: the same with the track as the whole run tells it. The checks judge
+        these.
       figures: name -> number, see `measure`.
     """
 
@@ -40,6 +41,7 @@ class Outcome:
     truth: Truth
     motion: RigidMotion
     trial: Trial
+    whole: Trial
     figures: dict[str, Any]
 
 
@@ -68,8 +70,8 @@ def resident_mb() -> float:
 def measure(scenario: Scenario) -> Outcome:
     """Simulates, runs with the defaults and compares.
 
-    The figures are robot_rmse_m (where the robot is not disturbed), online_rmse_m (the same of what was published on the
-    way), robot_max_m, heading_deg_median, beacon_mean_m,
+    The figures are robot_rmse_m (where the robot is not disturbed), online_rmse_m (the same of what was published on
+    the way, laid over the truth by itself), robot_max_m, heading_deg_median, beacon_mean_m,
     beacon_max_m, beacons_missing, covered, decided_s, sharpness, own_sharpness, stray, real_time_factor, peak_rss_mb,
     pose_nees_ratio and beacon_nees_ratio; NaN where there is nothing to compare.
     """
@@ -82,7 +84,7 @@ def measure(scenario: Scenario) -> Outcome:
     stamps, _ = _undisturbed(result, apart)
     calm = np.isin(result.stamps, stamps)
     trial = lay_over(result, truth, align(stamps, result.online[calm], {}, truth), messages.memory)
-    whole = dataclasses.replace(trial, poses=motion.poses(result.poses))
+    whole = dataclasses.replace(lay_over(result, truth, motion), poses=motion.poses(result.poses))
     of_all = evaluate(result.stamps, result.poses, beacons, truth)
     true = truth.beacon_positions()
     off = [np.linalg.norm(motion.points(xy[None])[0] - true[node]) for node, xy in beacons.items() if node in true]
@@ -100,7 +102,7 @@ def measure(scenario: Scenario) -> Outcome:
     figures |= {"decided_s": trial.decided}
     figures |= {key: result.summary[key] for key in ("real_time_factor", "peak_rss_mb")}
     figures |= consistency(result, truth)
-    return Outcome(result, truth, motion, trial, figures)
+    return Outcome(result, truth, motion, trial, whole, figures)
 
 
 def _of_the_map(image: MapImage, motion: RigidMotion, walls: np.ndarray) -> dict[str, float]:

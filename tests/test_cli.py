@@ -144,7 +144,7 @@ class TestRun:
         online, (grouped, _) = run_log(log, SMALL, online=True)[0], batch
         assert FRAMES % CONTROL_EVERY, "the last frames are no whole group: both ways of stepping take part"
         assert grouped.summary["decided_at"] is not None
-        for name in ("stamps", "poses", "pose_covs", "range_residuals", "scan_points"):
+        for name in ("stamps", "poses", "online_covs", "range_residuals", "scan_points"):
             assert np.array_equal(getattr(online, name), getattr(grouped, name)), name
         assert np.array_equal(online.map.log_odds, grouped.map.log_odds)
         assert [(b.id, *b.position, *b.cov.ravel()) for b in online.beacons] == [

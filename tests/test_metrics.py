@@ -266,7 +266,7 @@ def consistent_run(seed: int, *, frame_error: float = 0.0) -> tuple[Result, Trut
     summary = {"frame_beacons": [3, 8], "decided_at": 2000.0}
     poses[:2000, :2] += 3.0  # before the frame was decided nothing is judged
     nothing = np.zeros((0, 4))
-    return Result(truth.stamps, poses, covs, beacons, {}, empty, nothing, nothing[:, :2], summary=summary), truth
+    return Result(truth.stamps, poses, poses, covs, beacons, {}, empty, nothing, nothing[:, :2], summary=summary), truth
 
 
 def test_consistency_is_judged_in_the_frame_of_the_true_beacons() -> None:

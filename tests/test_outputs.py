@@ -34,7 +34,8 @@ def make_result() -> Result:
     return Result(
         stamps=stamps,
         poses=poses,
-        pose_covs=covs,
+        online=poses + 0.25,
+        online_covs=covs,
         beacons=[
             BeaconEstimate(4_000_000_000, np.array([5.0, 6.0]), np.diag([0.01, 0.04]), "silent"),
             BeaconEstimate(1, np.array([1.0, 2.0]), np.diag([0.04, 0.01]), "static"),
@@ -172,7 +173,8 @@ def test_an_empty_run(tmp_path: Path) -> None:
     empty = np.zeros((0, 4))
     image = MapImage(np.zeros((0, 0), np.float32), 0.05, np.zeros(2))
     covs = np.zeros((0, 3, 3))
-    write_result(Result(np.zeros(0, np.int64), np.zeros((0, 3)), covs, [], {}, image, empty, empty[:, :2]), tmp_path)
+    none = np.zeros((0, 3))
+    write_result(Result(np.zeros(0, np.int64), none, none, covs, [], {}, image, empty, empty[:, :2]), tmp_path)
     found = read_run(tmp_path)
     assert found.stamps.shape == (0,)
     assert found.poses.shape == (0, 3)
@@ -232,11 +234,11 @@ class TestResultLog:
         last = poses[-1]
         assert last.header.stamp.sec * 10**9 + last.header.stamp.nanosec == result.stamps[-1]
         position = last.pose.pose.position
-        assert (position.x, position.y) == pytest.approx((result.poses[-1, 0], result.poses[-1, 1]))
+        assert (position.x, position.y) == pytest.approx((result.online[-1, 0], result.online[-1, 1]))
         turn = last.pose.pose.orientation
-        assert 2 * math.atan2(turn.z, turn.w) == pytest.approx(result.poses[-1, 2])
+        assert 2 * math.atan2(turn.z, turn.w) == pytest.approx(result.online[-1, 2])
         cov = np.array(last.pose.covariance).reshape(6, 6)
-        np.testing.assert_array_equal(cov[np.ix_([0, 1, 5], [0, 1, 5])], result.pose_covs[-1])
+        np.testing.assert_array_equal(cov[np.ix_([0, 1, 5], [0, 1, 5])], result.online_covs[-1])
         assert np.count_nonzero(cov) == 9
 
     def test_path_and_transforms(self, messages: list[tuple[str, int, Any]]) -> None:

@@ -33,7 +33,7 @@ def make_result(frames: int = 200, **changes: Any) -> Result:
     fields: dict[str, Any] = {
         "stamps": START + np.arange(frames) * 100_000_000,
         "poses": np.column_stack([2 + np.cos(turn), 1.5 + np.sin(turn), turn + np.pi / 2]),
-        "pose_covs": np.broadcast_to(np.diag([0.01, 0.02, 0.001]) ** 2, (frames, 3, 3)),
+        "online_covs": np.broadcast_to(np.diag([0.01, 0.02, 0.001]) ** 2, (frames, 3, 3)),
         "beacons": [
             BeaconEstimate(1, np.array([0.0123, 3.4567]), np.diag([0.0042, 0.0051]) ** 2, "static"),
             BeaconEstimate(4294967295, np.array([3.9, 0.0]), np.diag([0.1, 0.1]), "silent"),
@@ -55,6 +55,7 @@ def make_result(frames: int = 200, **changes: Any) -> Result:
             "config": "[uwb]\nsigma_n = 0.125\n",
         },
     }
+    fields["online"] = changes.get("poses", fields["poses"])
     return Result(**{**fields, **changes})
 
 
@@ -62,7 +63,7 @@ def empty_result(**changes: Any) -> Result:
     """A run in which nothing was ever decided."""
     fields = {
         "poses": np.full((200, 3), np.nan),
-        "pose_covs": np.full((200, 3, 3), np.nan),
+        "online_covs": np.full((200, 3, 3), np.nan),
         "beacons": [],
         "beacon_tracks": {},
         "map": MapImage(np.zeros((4, 4), np.float32), 0.05, np.zeros(2)),
@@ -189,7 +190,7 @@ def test_nan_and_infinity_do_not_break_the_data(tmp_path: Path) -> None:
             poses=poses,
             range_residuals=residuals,
             map=MapImage(log_odds, 0.05, np.zeros(2)),
-            pose_covs=np.full((200, 3, 3), np.nan),
+            online_covs=np.full((200, 3, 3), np.nan),
             beacons=[BeaconEstimate(1, np.full(2, np.nan), np.full((2, 2), np.inf), "static")],
             diagnostics={"match_score": np.where(np.arange(200) % 2, np.nan, 0.5), "odd": np.full(200, np.nan)},
             summary={"real_time_factor": float("nan"), "wall_s": float("inf")},
@@ -219,7 +220,7 @@ def test_an_undecided_run_says_so(tmp_path: Path) -> None:
 
 def test_a_run_without_a_single_frame(tmp_path: Path) -> None:
     nothing = empty_result(
-        stamps=np.zeros(0, np.int64), poses=np.zeros((0, 3)), pose_covs=np.zeros((0, 3, 3)), frames=0
+        stamps=np.zeros(0, np.int64), poses=np.zeros((0, 3)), online_covs=np.zeros((0, 3, 3)), frames=0
     )
     page = page_of(tmp_path, nothing)
     assert "No scan was processed" in page

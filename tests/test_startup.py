@@ -12,6 +12,7 @@ from start_of_run import BEACONS, IDS, SETTINGS
 
 from uwbslam_jax import geometry, keyframes, layout, slam, startup
 from uwbslam_jax.config import make_config, make_params
+from uwbslam_jax.tiles import Tiles
 
 TRUTH = np.array(list(BEACONS.values()))
 CONFIG, PARAMS = make_config(SETTINGS), make_params(SETTINGS)
@@ -89,7 +90,7 @@ def adopted_case():
     cov[np.ix_(at, at)] = MOTION_COV
     state = state._replace(belief=state.belief._replace(mean=mean, cov=jnp.asarray(cov)))
     frame_slots = startup.choose_frame(outcome.placement, IDS)
-    adopted = startup.adopt(CONFIG, PARAMS, state, kept, outcome.placement, frame_slots)
+    adopted = startup.adopt(CONFIG, PARAMS, state, Tiles(CONFIG.resolution), kept, outcome.placement, frame_slots)
     return outcome.placement, state, frame_slots, adopted, pose
 
 

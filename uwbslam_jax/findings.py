@@ -90,9 +90,9 @@ def _biases(session: Session) -> list[str]:
     ids = {slot: node for node, slot in session.slots.items()}
     found = {ids[slot]: bias for slot, bias in session.found_bias.items()}
     told = ", ".join(f"node {node} {bias:+.2f} m" for node, bias in sorted(found.items()))
-    return (
-        [f"ranges are biased: {told} were solved from the run; set uwb.bias if the radios are known"] if found else []
-    )
+    told += f", and {100 * session.found_scale:+.1f} % of the distance" if abs(session.found_scale) > 0.001 else ""
+    advice = "set uwb.bias and uwb.bias_scale if the radios are known"
+    return [f"ranges are biased: {told} were solved from the run; {advice}"] if found else []
 
 
 def _beacons(session: Session, ids: dict[int, int]) -> list[BeaconEstimate]:
@@ -108,8 +108,10 @@ def _beacons(session: Session, ids: dict[int, int]) -> list[BeaconEstimate]:
     found = []
     for slot in range(1, len(active)):
         status = session.beacon_status(slot)
-        if session.graph.node(slot) in told and status != "moving":
-            found.append(BeaconEstimate(ids[slot], *told[session.graph.node(slot)], status))
+        node = session.graph.ranges.node(slot)
+        if node in told and status != "moving":
+            position, block = told[node]
+            found.append(BeaconEstimate(ids[slot], position, block, status))
         elif active[slot]:
             two = slice(2 * slot, 2 * slot + 2)
             found.append(BeaconEstimate(ids[slot], mean[two], cov[two, two], status))
@@ -208,6 +210,7 @@ def _summary(session: Session, facts: Facts) -> dict[str, Any]:
         "searches": total.get("searched", 0),
         "ranges_used": used,
         "ranges_rejected": rejected,
+        "found_bias_scale": session.found_scale,
         "found_bias": {str(ids[slot]): bias for slot, bias in sorted(session.found_bias.items())},
         "dropped": dict(sorted(facts.dropped.items())),
         "truncated": facts.truncated,

@@ -1,12 +1,10 @@
-"""The graph of a whole run: keyframes, which older ground each scan was matched with, and the ranges taken on the way.
+"""The graph of a whole run: keyframes, scans laid over older scans, and the ranges taken on the way.
 
-Collected while the steps run, solved by `smoothing`. A match is against ground that older keyframes drew, so what it
-measures is the pose relative to those: that is a loop closed, without any search. Host arrays; grows with the way.
+Collected while the steps run, solved by `smoothing`. Host arrays; grows with the way, not with the time.
 """
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -14,9 +12,9 @@ import jax
 import numpy as np
 
 from uwbslam_jax.config import Config, Params
-from uwbslam_jax.geometry import rotation
-from uwbslam_jax.keyframes import mean_sigma, turned
+from uwbslam_jax.keyframes import turned
 from uwbslam_jax.measurements import Scan, Snapshot, StampedFrame
+from uwbslam_jax.range_means import RangeMeans
 from uwbslam_jax.registration import register
 from uwbslam_jax.slam import Estimate
 
@@ -27,23 +25,27 @@ _BLIND_M = 0.3
 """A keyframe also after this time where the scan tells the position no better than this."""
 _SEEN_M = 0.05
 """A match that tells the position no better than this in some direction does not see it."""
-_NEAREST = 2
-_REACH_M = 10.0
-_TURN_M = 1.0
-_NEW_ANCHOR_M = 2.0
-_TIES = 4
 _FEWEST_RETURNS = 20
+"""A scan of fewer returns tells nothing."""
+_ANCHOR_M = 2.0
+"""A keyframe this far from every anchor is one: later scans are laid over anchors, so that a place that is passed
+again hangs on the first time and not on the time before."""
+_TURN_M = 1.0
+"""A turn of one radian makes two scans see as little of the same as so much way [m]."""
+_REACH_M = 10.0
+"""Anchors farther off are not tried."""
+_NEAREST = 2
+_TIES = 2 + _NEAREST
+"""A scan is laid over the one before, the nearest anchors, and the oldest one in reach."""
 _SHARE = 0.5
+"""Share of a scan's surfaces that have to lie on those of the older one."""
 _BELIEVED = (0.6, 0.6, 0.2)
-_WINDOW = 21
-_WILD_M = 0.5
-"""A range this far from the median of its interval takes no part in the mean."""
-_MOST_OF_PAIR = 400
+"""A scan that lies farther off than this from where the map has it was laid over something else [m, m, rad]."""
 _MM = 1000.0
 """Scans are kept in whole millimetres."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class Keyframe:
     """One pose of the graph.
 
@@ -69,16 +71,19 @@ class Keyframe:
 
     def snapshot(self) -> Snapshot:
         """Its scan as it was."""
-        return Snapshot(_unpacked(self.scan), np.float32(self.drift), np.float32(self.yaw_rate))
+        assert self.scan is not None
+        reach = self.scan.ranges.astype(np.float32) / np.float32(_MM)
+        scan = self.scan._replace(ranges=reach, valid=self.scan.ranges > 0)
+        return Snapshot(scan, np.float32(self.drift), np.float32(self.yaw_rate))
 
     @property
     def blind(self) -> bool:
         """Whether its scan does not tell where it is in some direction."""
-        return bool(np.linalg.eigvalsh(self.informed[:2, :2])[0] < _BLIND_M**-2)
+        return _blind(self.informed)
 
 
 class Edge(NamedTuple):
-    """A keyframe relative to an older one, by a match with the ground that the older one drew.
+    """A keyframe relative to an older one, by their scans.
 
     Attributes:
       old, new: numbers of the keyframes.
@@ -92,61 +97,24 @@ class Edge(NamedTuple):
     information: np.ndarray
 
 
-class Mean(NamedTuple):
-    """Ranges between the robot and a beacon at rest, averaged over half an interval between two keyframes.
-
-    Attributes:
-      at: keyframe before. node: (slot, number of its resting place). share: of the way to the next keyframe.
-      before, after: (2,) the antenna in the frame of the keyframe before and of the one after [m].
-      distance: as measured, sigma: its standard deviation [m].
-      loud: whether the ranges scatter more than the radio does.
-    """
-
-    at: int
-    node: tuple[int, int]
-    share: float
-    before: np.ndarray
-    after: np.ndarray
-    distance: float
-    sigma: float
-    loud: bool
-
-
-class _Heard(NamedTuple):
-    """One range of the robot: when [ns], the node, where the antenna was on the map (2,), distance, scatter [m]."""
-
-    stamp: float
-    node: tuple[int, int]
-    antenna: np.ndarray
-    distance: float
-    scatter: float
-
-
 @dataclass
 class Graph:
     """What was collected so far.
 
     Attributes:
-      keyframes, edges, means: see there.
-      pairs: ranges between two beacons at rest, the newest; by their nodes.
+      ranges, keyframes, edges: see there.
     """
 
-    sigma_n: float
+    ranges: RangeMeans
     keyframes: list[Keyframe] = field(default_factory=list)
     edges: list[Edge] = field(default_factory=list)
-    means: list[Mean] = field(default_factory=list)
-    pairs: dict[tuple[tuple[int, int], tuple[int, int]], deque[float]] = field(default_factory=dict)
-    _rests: dict[int, int] = field(default_factory=dict)
-    _newest: dict[int, deque[float]] = field(default_factory=dict)
-    _open: list[_Heard] = field(default_factory=list)
     _wheels: np.ndarray | None = field(default_factory=lambda: np.zeros(3))
     _broken: bool = False
     _anchors: list[int] = field(default_factory=list)
 
     def copy(self) -> Graph:
         """What there is now; what is added later does not change it."""
-        pairs = {pair: deque(kept) for pair, kept in self.pairs.items()}
-        return Graph(self.sigma_n, list(self.keyframes), list(self.edges), list(self.means), pairs)
+        return Graph(self.ranges.copy(), list(self.keyframes), list(self.edges))
 
     def poses(self) -> np.ndarray:
         """(N, 3) where the map has the keyframes [m, m, rad]."""
@@ -161,54 +129,46 @@ class Graph:
         tied = {edge.old for edge in self.edges} | {edge.new for edge in self.edges}
         return [(poses[k], self.keyframes[k].snapshot()) for k in sorted(tied) if k >= first]
 
-    def node(self, slot: int) -> tuple[int, int]:
-        """The place where a beacon rests now."""
-        return slot, self._rests.get(slot, 0)
-
     def placed(self, slot: int, since: int) -> None:
         """A beacon was found to rest where it was ranged from a time on [ns]; where it was before, nobody knows."""
-        node = self.node(slot)
-        self.means = [m for m in self.means if m.node != node or self.keyframes[m.at].stamp >= since]
+        self.ranges.forget(slot, lambda mean: self.keyframes[mean.at].stamp < since)
 
     def moved(self, slot: int) -> None:
         """A beacon is, or the robot (slot 0) was, somewhere else from now on."""
         if slot == 0:
             self._broken = True
-        self._rests[slot] = self._rests.get(slot, 0) + 1
-        self._newest.pop(slot, None)
+        else:
+            self.ranges.moved(slot)
 
-    def add(
-        self,
-        config: Config,
-        params: Params,
-        seen: list[tuple[int, StampedFrame, Estimate]],
-    ) -> None:
-        """Take in a few frames.
+    def put(self, poses: np.ndarray, turn: float) -> None:
+        """The map was drawn again: keyframes so far are at poses (N, 3) in it, turned by an angle [rad]."""
+        R = np.eye(3)
+        c, s = np.cos(turn), np.sin(turn)
+        R[:2, :2] = [[c, -s], [s, c]]
+        # new ones, not changed ones: a copy keeps what it has
+        self.keyframes = [
+            replace(key, pose=pose, informed=R @ key.informed @ R.T)
+            for key, pose in zip(self.keyframes, poses, strict=True)
+        ]
 
-        Args:
-          seen: number in the history, frame and estimate.
-        """
+    def add(self, config: Config, params: Params, seen: list[tuple[int, StampedFrame, Estimate]]) -> None:
+        """Take in a few frames. seen: number in the history, frame and estimate of each."""
         for number, frame, estimate in seen:
             pose = map_pose(estimate)
-            self._hear(frame, estimate, pose, params, config.nlos_gap_db)
+            self.ranges.hear(frame, estimate, pose, params, config.nlos_gap_db)
             self._roll(frame)
             informed = np.asarray(estimate.information, float)
             if self.keyframes and not self._far(pose, frame.stamp, informed):
                 continue
-            turn = turned(-pose[2], np.asarray(estimate.velocity, float))
+            drift = turned(-pose[2], np.asarray(estimate.velocity, float))
             scan = _packed(frame.frame.scan) if _sees(frame) else None
-            key = Keyframe(
-                frame.stamp,
-                number,
-                pose,
-                informed,
-                scan,
-                turn,
-                float(estimate.yaw_rate),
-                self._wheels,
-                self._broken,
-            )
-            self._close(key)
+            turning = float(estimate.yaw_rate)
+            key = Keyframe(frame.stamp, number, pose, informed, scan, drift, turning, self._wheels, self._broken)
+            if self._broken or not self.keyframes:
+                self.ranges.drop()
+            else:
+                last = self.keyframes[-1]
+                self.ranges.close(len(self.keyframes) - 1, (last.stamp, key.stamp), (last.pose, key.pose))
             self.keyframes.append(key)
             self._wheels, self._broken = np.zeros(3), False
             if scan is not None:
@@ -217,7 +177,7 @@ class Graph:
     def _far(self, pose: np.ndarray, stamp: int, informed: np.ndarray) -> bool:
         last = self.keyframes[-1]
         moved = relative(last.pose, pose)
-        late = stamp - last.stamp > _BLIND_S * 1e9 and np.linalg.eigvalsh(informed[:2, :2])[0] < _BLIND_M**-2
+        late = stamp - last.stamp > _BLIND_S * 1e9 and _blind(informed)
         return bool(self._broken or np.hypot(*moved[:2]) > _MOVED[0] or abs(wrapped(moved[2])) > _MOVED[1] or late)
 
     def _roll(self, frame: StampedFrame) -> None:
@@ -226,105 +186,35 @@ class Graph:
             self._wheels = None
         elif self._wheels is not None:
             step = np.asarray(odometry.increment, float)
-            self._wheels = np.append(
-                self._wheels[:2] + turned(self._wheels[2], step[:2]), self._wheels[2] + step[2]
-            )
-
-    def _hear(self, frame, estimate, pose, params, gap) -> None:
-        r = frame.frame.ranges
-        usable = np.asarray(r.valid) & ~(np.asarray(r.power_gap) > gap)
-        moving = np.asarray(estimate.moving)
-        usable &= ~(moving[r.i] | moving[r.j])
-        lever = np.asarray(params.antenna, float)
-        motion = np.append(np.asarray(estimate.velocity, float), float(estimate.yaw_rate))
-        for k in np.flatnonzero(usable):
-            i, j = sorted((int(r.i[k]), int(r.j[k])))
-            distance = float(r.range[k])
-            if i > 0:
-                kept = self.pairs.setdefault((self.node(i), self.node(j)), deque(maxlen=_MOST_OF_PAIR))
-                kept.append(distance)
-                continue
-            then = pose + float(r.age[k]) * motion
-            antenna = then[:2] + turned(then[2], lever)
-            stamp = frame.stamp + float(r.age[k]) * 1e9
-            newest = self._newest.setdefault(j, deque(maxlen=_WINDOW))
-            newest.append(distance)
-            self._open.append(_Heard(stamp, self.node(j), antenna, distance, self._scatter(newest)))
-
-    def _scatter(self, newest: deque[float]) -> float:
-        """Standard deviation of a pair's newest ranges by their second differences, see keyframes."""
-        if len(newest) < _WINDOW:
-            return self.sigma_n
-        d = np.array(newest)
-        # the median of |x| of a normal x is 0.674 sigma, and a second difference has 6 sigma^2
-        return float(np.median(np.abs(d[2:] - 2 * d[1:-1] + d[:-2])) / (0.674 * np.sqrt(6.0)))
-
-    def _close(self, key: Keyframe) -> None:
-        """Average what was heard between the last keyframe and this one."""
-        heard, self._open = self._open, []
-        if not self.keyframes or self._broken:
-            return
-        last, at = self.keyframes[-1], len(self.keyframes) - 1
-        span = max(key.stamp - last.stamp, 1)
-        groups: dict[tuple[tuple[int, int], bool], list[_Heard]] = {}
-        for one in heard:
-            groups.setdefault((one.node, one.stamp - last.stamp >= span / 2), []).append(one)
-        for (node, _), mine in groups.items():
-            distance = np.array([one.distance for one in mine])
-            middle = np.sort(distance)[len(distance) // 2]  # one of them, so that at least one is near it
-            ok = [one for one in mine if abs(one.distance - middle) < _WILD_M]
-            share = np.clip((np.mean([one.stamp for one in ok]) - last.stamp) / span, 0.0, 1.0)
-            antenna = np.mean([one.antenna for one in ok], axis=0)
-            scatter = float(np.median([one.scatter for one in mine]))
-            sigma = mean_sigma(len(ok), scatter, self.sigma_n)
-            self.means.append(
-                Mean(
-                    at,
-                    node,
-                    float(share),
-                    turned(-last.pose[2], antenna - last.pose[:2]),
-                    turned(-key.pose[2], antenna - key.pose[:2]),
-                    float(np.mean([one.distance for one in ok])),
-                    sigma,
-                    sigma > mean_sigma(1, self.sigma_n, self.sigma_n),
-                )
-            )
-
-    def put(self, poses: np.ndarray, turn: float) -> None:
-        """The map was drawn again: keyframes so far are at poses (N, 3) in it, turned by an angle [rad]."""
-        R = np.eye(3)
-        R[:2, :2] = np.array(rotation(turn))
-        # new ones, not changed ones: a copy keeps what it has
-        self.keyframes = [
-            replace(key, pose=pose, informed=R @ key.informed @ R.T)
-            for key, pose in zip(self.keyframes, poses, strict=True)
-        ]
+            self._wheels = np.append(self._wheels[:2] + turned(self._wheels[2], step[:2]), self._wheels[2] + step[2])
 
     def _tie(self, params: Params) -> None:
         """Edges from the newest keyframe to older ones whose scans it can be laid over."""
         new = len(self.keyframes) - 1
+        key, old = self.keyframes[new], self._candidates(new)
+        if not old:
+            return
+        padded = (old * _TIES)[:_TIES]  # always as many: nothing is compiled again
+        guess = np.array([relative(self.keyframes[k].pose, key.pose) for k in padded])
+        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *[self.keyframes[k].snapshot() for k in padded])
+        found = jax.device_get(register(params, stacked, key.snapshot(), np.float32(guess)))
+        for k, target in enumerate(old):
+            pose, information = (np.asarray(a[k], float) for a in (found.pose, found.information))
+            if found.share[k] > _SHARE and np.all(np.abs(pose - guess[k]) < _BELIEVED):
+                self.edges.append(Edge(target, new, pose, information))
+
+    def _candidates(self, new: int) -> list[int]:
+        """Keyframes to lay the newest one over: the one before, the nearest anchors, the oldest anchor in reach."""
         key = self.keyframes[new]
         poses = np.array([self.keyframes[k].pose for k in self._anchors]).reshape(-1, 3)
         apart = np.linalg.norm(poses[:, :2] - key.pose[:2], axis=1)
         cost = apart + np.abs(wrapped(poses[:, 2] - key.pose[2])) * _TURN_M
         near = [self._anchors[k] for k in np.argsort(cost, kind="stable")[:_NEAREST] if apart[k] < _REACH_M]
-        far = [self._anchors[k] for k in np.flatnonzero(apart < _REACH_M)[:1]]
+        oldest = [self._anchors[k] for k in np.flatnonzero(apart < _REACH_M)[:1]]
         last = [new - 1] if new > 0 and self.keyframes[new - 1].scan is not None and not key.broken else []
-        old = list(dict.fromkeys([*last, *near, *far]))
-        if not len(cost) or cost.min() > _NEW_ANCHOR_M:
+        if not len(cost) or cost.min() > _ANCHOR_M:
             self._anchors.append(new)
-        if not old:
-            return
-        padded = (old * _TIES)[:_TIES]
-        guess = np.array([relative(self.keyframes[k].pose, key.pose) for k in padded])
-        snapshots = [self.keyframes[k].snapshot() for k in padded]
-        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *snapshots)
-        found = jax.device_get(register(params, stacked, key.snapshot(), np.float32(guess)))
-        for k, target in enumerate(old):
-            off = np.abs(found.pose[k] - guess[k])
-            if found.share[k] > _SHARE and np.all(off < _BELIEVED):
-                pose, information = (np.asarray(a[k], float) for a in (found.pose, found.information))
-                self.edges.append(Edge(target, new, pose, information))
+        return list(dict.fromkeys([*last, *near, *oldest]))
 
 
 def map_pose(estimate: Estimate) -> np.ndarray:
@@ -353,14 +243,15 @@ def wrapped(angle):
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
+def _blind(informed: np.ndarray) -> bool:
+    return bool(np.linalg.eigvalsh(informed[:2, :2])[0] < _BLIND_M**-2)
+
+
 def _sees(frame: StampedFrame) -> bool:
     return bool(frame.frame.has_scan) and int(np.sum(frame.frame.scan.valid)) > _FEWEST_RETURNS
 
 
 def _packed(scan: Scan) -> Scan:
-    millimetres = np.where(scan.valid, np.round(np.asarray(scan.ranges) * _MM), 0).astype(np.uint16)
-    return scan._replace(ranges=millimetres, valid=None)
-
-
-def _unpacked(scan: Scan) -> Scan:
-    return scan._replace(ranges=scan.ranges.astype(np.float32) / np.float32(_MM), valid=scan.ranges > 0)
+    millimetres = np.where(scan.valid, np.round(np.asarray(scan.ranges, float) * _MM), 0)
+    # what is farther off than 16 bits can tell is farther off than the map's window
+    return scan._replace(ranges=np.where(millimetres < 2**16, millimetres, 0).astype(np.uint16), valid=None)

@@ -14,8 +14,10 @@ from uwbslam_jax.config import Params
 from uwbslam_jax.graph import Graph, relative, wrapped
 from uwbslam_jax.history import History
 from uwbslam_jax.keyframes import turned
-from uwbslam_jax.smoothing import Node, Solution, solve
+from uwbslam_jax.range_means import Node
+from uwbslam_jax.smoothing import Solution, solve
 from uwbslam_jax.startup import compose, frame_motion, numeric_jacobian, published
+
 
 class Question(NamedTuple):
     """What a solution of the run so far starts from.
@@ -40,7 +42,7 @@ class Hindsight(NamedTuple):
     """The run solved as a whole, in the published frame.
 
     Attributes:
-      solution: with poses, beacons and covariance in that frame; the covariance is of the last keyframe and the beacons.
+      solution: with poses, beacons and covariance in that frame.
       track: (T, 3) pose of every frame in the history [m, m, rad].
     """
 

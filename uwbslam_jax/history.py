@@ -89,7 +89,8 @@ class History:
         self.events.append((stamp, text))
 
     def carry_along(self, anchors: np.ndarray, before: np.ndarray, after: np.ndarray) -> None:
-        """The map was corrected: its keyframes (N,) [ns] moved from before (N, 3) to after. What was published stays."""
+        """The map was corrected: its keyframes, at anchors (N,) [ns], moved from before (N, 3) to after. What was
+        published stays."""
         self.map_poses = list(carried_along(np.array(self.stamps), np.array(self.map_poses), anchors, before, after))
 
     def republish(self, adopted: Adopted) -> None:

@@ -303,7 +303,7 @@ def _position_at(history: Float[np.ndarray, "n 3"], stamp: int) -> Float[np.ndar
 
 
 def consistency(result: Result, truth: Truth) -> dict[str, float]:
-    """NEES over degrees of freedom of a run: pose_nees_ratio of the robot's poses as published since the frame was decided,
+    """NEES over degrees of freedom of a run: pose_nees_ratio of the poses published since the frame was decided,
     beacon_nees_ratio of the beacons' last positions. NaN where the truth does not know the frame's beacons.
 
     The truth is put into the published frame by its own two beacons and not by a fit: a fit would take out the very

@@ -90,9 +90,10 @@ def _packed(message: Any) -> tuple[str, bytes]:
 
 def _poses(result: Result, known: np.ndarray) -> Iterator[_Item]:
     for index in known:
-        stamp, (x, y, yaw) = int(result.stamps[index]), result.online[index].tolist()
-        yield _Item(stamp, "/pose", partial(_pose, stamp, x, y, yaw, result.online_covs[index]))
-        yield _Item(stamp, "/tf", partial(_robot_transform, stamp, x, y, yaw))
+        stamp = int(result.stamps[index])
+        # /pose is what was published then, with the covariance that it had; /tf belongs to the map and the path
+        yield _Item(stamp, "/pose", partial(_pose, stamp, *result.online[index].tolist(), result.online_covs[index]))
+        yield _Item(stamp, "/tf", partial(_robot_transform, stamp, *result.poses[index].tolist()))
 
 
 def _beacons(result: Result, start: int) -> Iterator[_Item]:

@@ -139,7 +139,7 @@ def take_over(config: Config, params: Params, revision: Revision, state: State, 
     pose = compose(solution.poses[-1], relative(graph.keyframes[count - 1].pose, on_map))
     pose[2] = old[2] + wrapped(pose[2] - old[2])
     cov = _cov(solution, at, pose, float(np.sum(np.hypot(*np.diff(poses[count - 1 :, :2], axis=0).T))))
-    others = [slot for slot in np.flatnonzero(np.asarray(state.active)) if slot > 0 and slot not in slots]
+    others = [slot for slot in map(int, np.flatnonzero(np.asarray(state.active))) if slot > 0 and slot not in slots]
     values = np.concatenate([pose, places.ravel()])
     belief = anchored(state.belief, config.nodes, values, cov, slots, old, others)
     # a buffer of its own: the step donates its state
@@ -156,7 +156,9 @@ def take_over(config: Config, params: Params, revision: Revision, state: State, 
 def _current(solution: Solution, graph: Graph) -> tuple[list[int], np.ndarray, list[int]]:
     """Slots of the beacons that still rest where the solution has them, their places (B, 2), their numbers in it."""
     sigma = largest_sigma(solution.cov[3:, 3:])
-    at = [b for b, node in enumerate(solution.nodes) if graph.node(node[0]) == node and sigma[b] < SIGMA_ENOUGH_M]
+    at = [
+        b for b, node in enumerate(solution.nodes) if graph.ranges.node(node[0]) == node and sigma[b] < SIGMA_ENOUGH_M
+    ]
     return [solution.nodes[b][0] for b in at], solution.beacons[at], at
 
 

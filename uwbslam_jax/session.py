@@ -25,11 +25,12 @@ from uwbslam_jax.hindsight import Hindsight, Question, look_back
 from uwbslam_jax.history import History
 from uwbslam_jax.keyframes import Buffer
 from uwbslam_jax.measurements import Frame, StampedFrame
+from uwbslam_jax.range_means import Node, RangeMeans
 from uwbslam_jax.redraw import redraw
 from uwbslam_jax.revision import Reviser, is_news, take_over
 from uwbslam_jax.sightings import MEMORY_S
 from uwbslam_jax.slam import Estimate, State
-from uwbslam_jax.smoothing import Node, Solution
+from uwbslam_jax.smoothing import Solution
 from uwbslam_jax.tiles import Tiles
 
 CONTROL_EVERY = 10
@@ -70,6 +71,7 @@ class Session:
       decided_at: stamp of the frame at which the published frame was decided, None before [ns].
       status: of the start-up, in words.
       found_bias: slot -> range bias that was found beyond the configured one [m]; empty where there is none.
+      found_scale: what of the ranges' biases was found to grow with the distance, beyond the configured share [m/m].
       history: what was reported so far.
     """
 
@@ -85,12 +87,13 @@ class Session:
         self.status = "LiDAR only" if settings.filter.lidar_only else "waiting for motion"
         self.hypotheses = 0
         self.found_bias: dict[int, float] = {}
+        self.found_scale = 0.0
         self._slots: dict[int, int] = {settings.robot.id: 0}
         self._pending: list[tuple[StampedFrame, Estimate]] = []
         self._solved_at = self._solved_with = 0
         self._buffer = self._new_buffer()
         self._keeper = BeaconKeeper(settings)
-        self.graph = Graph(settings.uwb.sigma_n)
+        self.graph = Graph(RangeMeans(settings.uwb.sigma_n))
         self.hindsight: Hindsight | None = None
         self._looks_back = settings.filter.preset == "robust" and not settings.filter.lidar_only
         self._reviser = Reviser()
@@ -147,7 +150,9 @@ class Session:
             return None
         positions = np.asarray(layout.unpack(self.state.belief.mean).positions, float)
         resting = np.asarray(self.state.active) & ~np.asarray(self.state.moving)
-        places = self._places | {self.graph.node(slot): positions[slot] for slot in np.flatnonzero(resting) if slot > 0}
+        places = self._places | {
+            self.graph.ranges.node(slot): positions[slot] for slot in map(int, np.flatnonzero(resting)) if slot > 0
+        }
         poses = np.array([self.history.poses[key.frame] for key in self.graph.keyframes]).reshape(-1, 3)
         configured = make_params(self.settings, self._slots)
         return Question(self.graph.copy(), poses, places, configured, self._frame_nodes, bool(self.found_bias))
@@ -163,7 +168,8 @@ class Session:
         bias = np.array(params.bias)
         for slot, found in self.found_bias.items():
             bias[slot] += found
-        return params._replace(bias=jnp.asarray(bias, jnp.float32))
+        scale = (1.0 + params.bias_scale) * (1.0 + self.found_scale) - 1.0
+        return params._replace(bias=jnp.asarray(bias, jnp.float32), bias_scale=jnp.asarray(scale, jnp.float32))
 
     def _new_buffer(self) -> Buffer:
         p = self.params
@@ -216,7 +222,7 @@ class Session:
         )
         self.state, self.decided_at = adopted.state, now
         self.config = make_config(self.settings)
-        self._frame_nodes = self.graph.node(origin), self.graph.node(along)
+        self._frame_nodes = self.graph.ranges.node(origin), self.graph.ranges.node(along)
         self.history.republish(adopted)
         self.graph.put(adopted.republish(self.graph.stamps(), self.graph.poses()), adopted.turn)
         self.history.event(now, f"frame decided by beacons {ids[origin]} and {ids[along]}")
@@ -242,7 +248,7 @@ class Session:
             self.graph.placed(slot, now - round(MEMORY_S * 1e9))
         elif slot == 0 or any(word in text for word in ("carried", "put down", "was moved", "dropped")):
             if slot in self.history.beacons:
-                self._places[self.graph.node(slot)] = np.asarray(self.history.beacons[slot][0], float)
+                self._places[self.graph.ranges.node(slot)] = np.asarray(self.history.beacons[slot][0], float)
             self.graph.moved(slot)
 
     def _revise(self, now: int) -> None:
@@ -269,7 +275,7 @@ class Session:
             return
         if not self.found_bias:
             self.history.event(now, "ranges are biased: biases and beacons solved from the run so far")
-        self.found_bias = solution.bias
+        self.found_bias, self.found_scale = solution.bias, solution.bias_scale
         self.params = self._biased(make_params(self.settings, self._slots))
 
     def beacon_status(self, slot: int) -> str:

@@ -7,7 +7,7 @@ While the step runs on LiDAR (and odometry) alone, a `Buffer` keeps keyframes an
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -211,7 +211,8 @@ def adopt(
     return Adopted(adopted, np.array([key.frame.stamp for key in keys]), before, after)
 
 
-def frame_motion(beacons: np.ndarray, slots: list[int], frame_slots: tuple[int, int]) -> np.ndarray:
+def frame_motion(beacons: np.ndarray, slots: Sequence[Hashable], frame_slots: Sequence[Hashable]) -> np.ndarray:
+    """(3,) the rigid motion that puts one of the beacons (B, 2) at the origin and another on +x."""
     origin, along = (beacons[slots.index(s)] for s in frame_slots)
     theta = -np.arctan2(along[1] - origin[1], along[0] - origin[0])
     return np.append(-rotation(theta) @ origin, theta)

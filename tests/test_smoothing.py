@@ -1,0 +1,209 @@
+"""The run solved at once: right on made-up graphs, derivatives against differences, outliers and biases."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from uwbslam_jax import smoothing
+from uwbslam_jax.graph import Edge, Graph, Keyframe, relative
+from uwbslam_jax.range_means import Mean, RangeMeans
+
+BEACONS = {1: np.array([-3.0, 5.0]), 2: np.array([9.0, 6.0]), 3: np.array([8.0, -4.0]), 4: np.array([-2.0, -3.0])}
+SIGMA_N = 0.1
+ANTENNA = np.array([0.1, -0.05])
+K = 5
+
+
+def loop(count: int = 80) -> np.ndarray:
+    """Twice around an ellipse among the beacons."""
+    a = np.linspace(0.0, 4 * np.pi, count)
+    x, y = 3 + 5 * np.cos(a), 1 + 3.5 * np.sin(a)
+    return np.column_stack([x, y, np.unwrap(np.arctan2(3.5 * np.cos(a), -5 * np.sin(a)))])
+
+
+def turned(theta: float, v: np.ndarray) -> np.ndarray:
+    c, s = np.cos(theta), np.sin(theta)
+    return np.array([c * v[0] - s * v[1], s * v[0] + c * v[1]])
+
+
+def make(truth: np.ndarray, seed: int = 0, bias=None, scale: float = 0.0, sight: np.ndarray | None = None) -> Graph:
+    """A graph of a track: edges to the keyframe before, and to the one a round before, ranges to every beacon.
+
+    bias: by slot [m]; scale: share of the distance [m/m]; sight: (3, 3) information of every edge.
+    """
+    rng = np.random.default_rng(seed)
+    bias = bias or dict.fromkeys(range(K), 0.0)
+    information = np.diag([0.005**-2, 0.005**-2, 0.001**-2]) if sight is None else sight
+    drift = np.cumsum(rng.normal(0, [0.01, 0.01, 0.002], truth.shape), axis=0)
+    keys = [
+        Keyframe(k * 400_000_000, k, truth[k] + drift[k], information, None, np.zeros(2), 0.0, None, False)
+        for k in range(len(truth))
+    ]
+    graph = Graph(RangeMeans(SIGMA_N), keys)
+    spread = np.linalg.pinv(information)
+    for new in range(1, len(truth)):
+        for old in {new - 1, max(new - len(truth) // 2, 0)} - {new}:
+            z = relative(truth[old], truth[new]) + rng.multivariate_normal(np.zeros(3), spread)
+            graph.edges.append(Edge(old, new, z, information))
+    for at in range(len(truth) - 1):
+        for slot, spot in BEACONS.items():
+            for share in (0.25, 0.75):
+                pose = (1 - share) * truth[at] + share * truth[at + 1]
+                antenna = pose[:2] + turned(pose[2], ANTENNA)
+                ends = [turned(-p[2], antenna - p[:2]) for p in truth[[at, at + 1]]]
+                d = (1 + scale) * np.linalg.norm(antenna - spot) + bias[0] + bias[slot] + rng.normal(0, 0.05)
+                graph.ranges.means.append(Mean(at, (slot, 0), share, *ends, float(d), 0.05, False))
+    for i in BEACONS:
+        for j in BEACONS:
+            if i < j:
+                d = (1 + scale) * np.linalg.norm(BEACONS[i] - BEACONS[j]) + bias[i] + bias[j]
+                graph.ranges.pairs[(i, 0), (j, 0)] = deque(d + rng.normal(0, SIGMA_N, 200))
+    return graph
+
+
+def solved(graph: Graph, **changes) -> smoothing.Solution:
+    rng = np.random.default_rng(99)
+    places = {(slot, 0): spot + rng.normal(0, 0.2, 2) for slot, spot in BEACONS.items()}
+    arguments = {"height": np.zeros(K), "bias": np.zeros(K), "bias_scale": 0.0} | changes
+    found = smoothing.solve(graph, graph.poses(), places, **arguments)
+    assert found is not None
+    return found
+
+
+def apart(found: smoothing.Solution, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of poses (N,) and beacons (B,) after the one rigid motion that lays both over the truth [m]."""
+    a = np.concatenate([found.poses[:, :2], found.beacons])
+    b = np.concatenate([truth[:, :2], np.array([BEACONS[slot] for slot, _ in found.nodes])])
+    ca, cb = a.mean(0), b.mean(0)
+    u, _, vt = np.linalg.svd((a - ca).T @ (b - cb))
+    R = vt.T @ np.diag([1, np.linalg.det(vt.T @ u.T)]) @ u.T
+    off = np.linalg.norm((a - ca) @ R.T + cb - b, axis=1)
+    return off[: len(truth)], off[len(truth) :]
+
+
+def test_a_run_is_solved_to_millimetres() -> None:
+    truth = loop()
+    graph = make(truth)
+    found = solved(graph)
+    robot, beacons = apart(found, truth)
+    assert np.sqrt(np.mean(robot**2)) < 0.01  # edges of 5 mm, closed every round
+    assert beacons.max() < 0.03  # 158 means of 5 cm
+    assert not found.biased
+    drifted = np.sqrt(np.mean(np.sum((graph.poses()[:, :2] - truth[:, :2]) ** 2, axis=1)))
+    assert drifted > 0.03  # what it started from was worse
+
+
+def nees(found: smoothing.Solution, truth: np.ndarray) -> float:
+    """Squared Mahalanobis distance of the beacons, 8 degrees of freedom, in the frame of the first pose."""
+    to = relative(found.poses[0], np.column_stack([found.beacons, np.zeros(4)]))[:, :2]
+    true = np.array([turned(-truth[0, 2], BEACONS[slot] - truth[0, :2]) for slot, _ in found.nodes])
+    e = np.array([turned(found.poses[0, 2], d) for d in to - true]).ravel()
+    return float(e @ np.linalg.solve(found.cov[3:, 3:], e))
+
+
+def test_the_covariance_is_what_it_says() -> None:
+    truth, runs = loop(60), 25
+    mean = np.mean([nees(solved(make(truth, seed)), truth) for seed in range(runs)]) / 8
+    assert 0.6 < mean < 1.5  # 200 degrees of freedom: three sigma are 0.3
+
+
+def test_edges_that_are_wrong_are_left_out() -> None:
+    truth = loop()
+    graph = make(truth)
+    for k in range(10, 70, 15):
+        wrong = relative(truth[k - 8], truth[k]) + np.array([0.5, -0.4, 0.1])
+        graph.edges.append(Edge(k - 8, k, wrong, graph.edges[0].information))
+    robot, beacons = apart(solved(graph), truth)
+    assert np.sqrt(np.mean(robot**2)) < 0.015
+    assert beacons.max() < 0.03
+
+
+def test_ranges_that_are_wrong_are_left_out() -> None:
+    truth = loop()
+    graph = make(truth)
+    graph.ranges.means = [
+        m._replace(distance=m.distance + 2.0) if n % 7 == 0 else m for n, m in enumerate(graph.ranges.means)
+    ]
+    robot, beacons = apart(solved(graph), truth)
+    assert np.sqrt(np.mean(robot**2)) < 0.01
+    assert beacons.max() < 0.04
+
+
+def test_biases_are_found_and_not_invented() -> None:
+    truth = loop()
+    bias = {0: 0.05, 1: 0.2, 2: -0.15, 3: 0.1, 4: -0.2}
+    found = solved(make(truth, bias=bias))
+    assert found.biased
+    assert nees(found, truth) < 26.1  # chi-square of 8 degrees of freedom, 0.1 %
+    for slot in bias:
+        assert abs(found.bias[slot] - bias[slot]) < 3.3 * found.bias_sigma[slot]
+        assert found.bias_sigma[slot] < 0.15
+    assert not solved(make(truth, seed=5)).biased
+
+
+def test_a_bias_that_grows_with_the_distance_is_found() -> None:
+    truth = loop()
+    found = solved(make(truth, scale=0.05))
+    assert found.biased
+    assert found.bias_scale == pytest.approx(0.05, abs=0.015)
+    assert nees(found, truth) < 26.1  # chi-square of 8 degrees of freedom, 0.1 %
+
+
+def test_configured_biases_and_heights_are_taken_off() -> None:
+    truth = loop()
+    bias = np.array([0.05, 0.2, -0.15, 0.1, -0.2])
+    graph = make(truth, bias=dict(enumerate(bias)))
+    offset = [bias[0] + bias[mean.node[0]] for mean in graph.ranges.means]
+    graph.ranges.means = [
+        mean._replace(distance=float(np.hypot(mean.distance - off, 1.5)) + off)
+        for mean, off in zip(graph.ranges.means, offset, strict=True)
+    ]
+    found = solved(graph, bias=bias, height=np.array([0.0, 1.5, 1.5, 1.5, 1.5]))
+    assert not found.biased
+    assert apart(found, truth)[1].max() < 0.03
+
+
+def test_where_scans_are_blind_ranges_and_an_even_drive_tell_the_way() -> None:
+    """Edges that tell nothing along x: the track along x is that of the ranges, not that of the map."""
+    sway = np.sin(np.linspace(0, 6, 60))
+    truth = np.column_stack([np.linspace(0, 8, 60), 0.3 * sway, 0.05 * sway])
+    graph = make(truth, sight=np.diag([0.0, 0.005**-2, 0.001**-2]))
+    wrong = graph.poses()
+    wrong[:, 0] *= 0.8
+    graph.put(wrong, 0.0)
+    robot, _ = apart(solved(graph), truth)
+    assert np.sqrt(np.mean(robot**2)) < 0.04
+
+
+def test_too_little_gives_nothing() -> None:
+    graph = make(loop(60))
+    places = {(slot, 0): spot for slot, spot in BEACONS.items()}
+    empty = Graph(RangeMeans(SIGMA_N))
+    zeros = np.zeros(K)
+    assert smoothing.solve(empty, empty.poses(), places, zeros, zeros, 0.0) is None
+    assert smoothing.solve(graph, graph.poses(), {}, zeros, zeros, 0.0) is None
+
+
+def test_derivatives_agree_with_differences() -> None:
+    truth = loop(12)
+    graph = make(truth, sight=np.diag([0.2**-2, 0.02**-2, 0.004**-2]))
+    keys = [replace(key, informed=np.zeros((3, 3))) for key in graph.keyframes]  # blind: the even drive counts
+    graph.keyframes = keys
+    places = {(slot, 0): spot for slot, spot in BEACONS.items()}
+    problem = smoothing._Problem.build(graph, places, np.array([0.0, 1.0, 0.5, 0.0, 2.0]), np.zeros(K), 0.02)
+    rng = np.random.default_rng(3)
+    x = problem.start(graph.poses() + rng.normal(0, 0.05, truth.shape), places)
+    x[-6:] += rng.normal(0, 0.05, 6)
+    stage, sigmas = (1e6, 1.0), (0.3, 0.1)  # edges not softened: their reweighting is no derivative of the residual
+    J, _ = problem._linearise(x, x[:3], sigmas, stage)
+    h = 1e-6
+    for column in rng.choice(len(x), 40, replace=False):
+        e = h * np.eye(len(x))[column]
+        ahead = problem._linearise(x + e, x[:3], sigmas, stage)[1]
+        behind = problem._linearise(x - e, x[:3], sigmas, stage)[1]
+        want = (ahead - behind) / (2 * h)
+        np.testing.assert_allclose(J[:, [column]].toarray()[:, 0], want, rtol=1e-4, atol=1e-4 * max(1, abs(want).max()))

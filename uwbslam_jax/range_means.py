@@ -1,0 +1,153 @@
+"""Ranges of a run, averaged between keyframes, by the place where each beacon rests. Host arrays; bounded by the way.
+
+Raw ranges wait until the next keyframe is there: only then is it known where on the way they were taken.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict, deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from uwbslam_jax.config import Params
+from uwbslam_jax.keyframes import mean_sigma, turned
+from uwbslam_jax.measurements import StampedFrame
+from uwbslam_jax.slam import Estimate
+
+_WINDOW = 21
+"""So many ranges of a pair tell how much they scatter."""
+_WILD_M = 0.5
+"""A range this far from the median of its interval takes no part in the mean."""
+_MOST = 400
+"""Newest ranges of a pair that are kept: of two beacons, or while the robot rests."""
+
+Node = tuple[int, int]
+"""A beacon at one of its resting places: slot, number of the place."""
+
+
+class Mean(NamedTuple):
+    """Ranges between the robot and a beacon at rest, averaged over half an interval between two keyframes.
+
+    Attributes:
+      at: keyframe before. node: see there. share: of the way to the next keyframe.
+      before, after: (2,) the antenna in the frame of the keyframe before and of the one after [m].
+      distance: as measured, sigma: its standard deviation [m].
+      loud: whether the ranges scatter more than the radio does.
+    """
+
+    at: int
+    node: Node
+    share: float
+    before: np.ndarray
+    after: np.ndarray
+    distance: float
+    sigma: float
+    loud: bool
+
+
+class _Heard(NamedTuple):
+    """One range of the robot: when [ns], where the antenna was on the map (2,), distance and scatter [m]."""
+
+    stamp: float
+    antenna: np.ndarray
+    distance: float
+    scatter: float
+
+
+@dataclass
+class RangeMeans:
+    """What was ranged so far.
+
+    Attributes:
+      sigma_n: standard deviation of a range [m].
+      means: see there. pairs: newest ranges between two beacons at rest, by their nodes.
+    """
+
+    sigma_n: float
+    means: list[Mean] = field(default_factory=list)
+    pairs: dict[tuple[Node, Node], deque[float]] = field(default_factory=dict)
+    _places: dict[int, int] = field(default_factory=dict)
+    _newest: dict[int, deque[float]] = field(default_factory=dict)
+    _open: dict[Node, deque[_Heard]] = field(default_factory=dict)
+
+    def copy(self) -> RangeMeans:
+        """The means and pairs there are now; what is added later does not change them."""
+        pairs = {pair: deque(kept) for pair, kept in self.pairs.items()}
+        return RangeMeans(self.sigma_n, list(self.means), pairs)
+
+    def node(self, slot: int) -> Node:
+        """The place where a beacon rests now."""
+        return slot, self._places.get(slot, 0)
+
+    def moved(self, slot: int) -> None:
+        """A beacon is somewhere else from now on."""
+        self._places[slot] = self._places.get(slot, 0) + 1
+        self._newest.pop(slot, None)
+
+    def forget(self, slot: int, before: Callable[[Mean], bool]) -> None:
+        """Leave out some of the means of a beacon's present place: it may have been elsewhere then."""
+        node = self.node(slot)
+        self.means = [mean for mean in self.means if mean.node != node or not before(mean)]
+
+    def hear(
+        self, frame: StampedFrame, estimate: Estimate, pose: np.ndarray, params: Params, nlos_gap_db: float
+    ) -> None:
+        """Take in one frame's ranges between nodes at rest, or that are not known to move. pose: (3,) on the map."""
+        r = frame.frame.ranges
+        moving = np.asarray(estimate.moving)
+        usable = np.asarray(r.valid) & ~(np.asarray(r.power_gap) > nlos_gap_db) & ~(moving[r.i] | moving[r.j])
+        lever = np.asarray(params.antenna, float)
+        motion = np.append(np.asarray(estimate.velocity, float), float(estimate.yaw_rate))
+        for k in np.flatnonzero(usable):
+            i, j = sorted((int(r.i[k]), int(r.j[k])))
+            distance, age = float(r.range[k]), float(r.age[k])
+            if i > 0:
+                self.pairs.setdefault((self.node(i), self.node(j)), deque(maxlen=_MOST)).append(distance)
+                continue
+            then = pose + age * motion
+            newest = self._newest.setdefault(j, deque(maxlen=_WINDOW))
+            newest.append(distance)
+            heard = _Heard(frame.stamp + age * 1e9, then[:2] + turned(then[2], lever), distance, self._scatter(newest))
+            self._open.setdefault(self.node(j), deque(maxlen=_MOST)).append(heard)
+
+    def _scatter(self, newest: deque[float]) -> float:
+        """Standard deviation of a pair's newest ranges by their second differences, see keyframes [m]."""
+        if len(newest) < _WINDOW:
+            return self.sigma_n
+        d = np.array(newest)
+        # the median of |x| of a normal x is 0.674 sigma, and a second difference has 6 sigma^2
+        return float(np.median(np.abs(d[2:] - 2 * d[1:-1] + d[:-2])) / (0.674 * np.sqrt(6.0)))
+
+    def close(self, at: int, stamps: tuple[int, int], poses: tuple[np.ndarray, np.ndarray]) -> None:
+        """Average what was heard on the way from one keyframe to the next.
+
+        Args:
+          at: number of the first. stamps [ns], poses (3,) of both.
+        """
+        span = max(stamps[1] - stamps[0], 1)
+        for node, heard in self._open.items():
+            # two means in each interval: one would leave the keyframes free to move to and fro between their middles
+            halves: dict[bool, list[_Heard]] = defaultdict(list)
+            for one in heard:
+                halves[one.stamp - stamps[0] >= span / 2].append(one)
+            self.means += map(partial(self._mean, at, node, stamps[0], span, poses), halves.values())
+        self.drop()
+
+    def drop(self) -> None:
+        """Leave out what was heard since the last keyframe."""
+        self._open.clear()
+
+    def _mean(self, at, node, start, span, poses, heard: list[_Heard]) -> Mean:
+        distance = np.array([one.distance for one in heard])
+        middle = np.sort(distance)[len(distance) // 2]  # one of them, so that at least one is near it
+        ok = [one for one in heard if abs(one.distance - middle) < _WILD_M]
+        share = np.clip((np.mean([one.stamp for one in ok]) - start) / span, 0.0, 1.0)
+        antenna = np.mean([one.antenna for one in ok], axis=0)
+        before, after = (turned(-pose[2], antenna - pose[:2]) for pose in poses)
+        sigma = mean_sigma(len(ok), float(np.median([one.scatter for one in heard])), self.sigma_n)
+        loud = sigma > mean_sigma(1, self.sigma_n, self.sigma_n)
+        return Mean(at, node, float(share), before, after, float(np.mean([one.distance for one in ok])), sigma, loud)
