@@ -86,7 +86,7 @@ def summary_table(rows: dict[str, list[Seed]], facts: dict[str, str]) -> str:
     lines += [
         "Figures are worst / median of the seeds, after one rigid motion over robot and beacons. "
         "Every seed has its own world. "
-        "Robot RMS: of the track in trajectory.tum, which the whole run tells; online: of what was published at the time, "
+        "Robot RMS: of the track in trajectory.tum, which the whole run tells; online: of what was published then, "
         "laid over the truth by itself. "
         "Bar: robot RMS [m] / beacons mean [m] / heading median [deg] where asked, then the row's own checks. "
         "A row passes when every seed holds its bar, places every beacon and covers the whole time, and when at most "

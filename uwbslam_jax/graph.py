@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from scipy import sparse
 
 from uwbslam_jax.config import Config, Params
 from uwbslam_jax.keyframes import turned
@@ -41,6 +42,8 @@ _SHARE = 0.5
 """Share of a scan's surfaces that have to lie on those of the older one."""
 _BELIEVED = (0.6, 0.6, 0.2)
 """A scan that lies farther off than this from where the map has it was laid over something else [m, m, rad]."""
+_HANG_TOGETHER = 8
+"""So many keyframes whose scans lie over each other are a place."""
 _MM = 1000.0
 """Scans are kept in whole millimetres."""
 
@@ -125,9 +128,18 @@ class Graph:
         return np.array([key.stamp for key in self.keyframes], np.int64)
 
     def seen(self, poses: np.ndarray, first: int = 0) -> list[tuple[np.ndarray, Snapshot]]:
-        """What may be drawn, from a first keyframe on: the scans that were laid over others, at poses (N, 3)."""
-        tied = {edge.old for edge in self.edges} | {edge.new for edge in self.edges}
-        return [(poses[k], self.keyframes[k].snapshot()) for k in sorted(tied) if k >= first]
+        """What may be drawn, from a first keyframe on, at poses (N, 3): scans that hang together with many others.
+
+        A few that hang only on each other were taken where nothing could be told: in somebody's arms, in smoke.
+        """
+        count = len(self.keyframes)
+        ends = np.array([(edge.old, edge.new) for edge in self.edges], int).reshape(-1, 2)
+        tied = sparse.coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
+        _, part = sparse.csgraph.connected_components(tied, directed=False)
+        size = np.bincount(part, minlength=1)
+        kept = size >= min(_HANG_TOGETHER, size.max())
+        drawn = [k for k in np.flatnonzero(kept[part]) if k >= first and self.keyframes[k].scan is not None]
+        return [(poses[k], self.keyframes[k].snapshot()) for k in drawn]
 
     def placed(self, slot: int, since: int) -> None:
         """A beacon was found to rest where it was ranged from a time on [ns]; where it was before, nobody knows."""
