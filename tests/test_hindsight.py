@@ -1,0 +1,160 @@
+"""A run looks back: corrected while it goes on, solved when it ends; the same bits online and in batch."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import small_room as room
+from test_session import BEACONS, SETTINGS, Drive, assert_same_bits, pose_at
+
+from uwbslam_jax.config import FilterSettings, UwbSettings
+from uwbslam_jax.graph import wrapped
+from uwbslam_jax.hindsight import _track
+from uwbslam_jax.metrics import rigid_fit
+from uwbslam_jax.session import CONTROL_EVERY, Session
+
+NODES = (10, 20, 30)
+BIAS = {10: 0.3, 20: -0.3, 30: 0.25}
+"""Antenna delays that nobody configured [m]."""
+LOOKS = 36
+"""Nearly two rounds of the room."""
+
+
+def driven(settings=SETTINGS, bias=None, online: bool = False) -> tuple[Session, np.ndarray]:
+    """A finished run, and where the robot truly was at each frame (T, 3)."""
+    run = Session(settings)
+    drive = Drive(run)
+    begin = drive.time
+    frames = drive.frames(LOOKS * CONTROL_EVERY, NODES)
+    for frame in frames:
+        r = frame.frame.ranges
+        for node, by in (bias or {}).items():
+            r.range[(r.i == frame.slots[node]) | (r.j == frame.slots[node])] += np.float32(by)
+    for k in range(LOOKS):
+        group = frames[CONTROL_EVERY * k : CONTROL_EVERY * (k + 1)]
+        if online:
+            for frame in group:
+                run.step(frame)
+        else:
+            run.steps(group)
+    run.finish()
+    times = begin + 0.1 * np.arange(1, len(frames) + 1)
+    return run, np.array([pose_at(t) for t in times])
+
+
+def off(run: Session, track: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of a track (T,) and of the beacons (B,) after one rigid motion over both [m]."""
+    assert run.hindsight is not None
+    solution = run.hindsight.solution
+    ids = {slot: node for node, slot in run.slots.items()}
+    spots = np.array([BEACONS[ids[slot]] for slot, _ in solution.nodes])
+    a, b = np.concatenate([track[:, :2], solution.beacons]), np.concatenate([truth[:, :2], spots])
+    errors = np.linalg.norm(rigid_fit(a, b).points(a) - b, axis=1)
+    return errors[: len(track)], errors[len(track) :]
+
+
+@pytest.fixture(scope="module")
+def finished() -> tuple[Session, np.ndarray]:
+    return driven()
+
+
+@pytest.fixture(scope="module")
+def biased() -> tuple[Session, np.ndarray]:
+    return driven(bias=BIAS)
+
+
+def test_a_finished_run_is_better_than_what_was_published(finished) -> None:
+    run, truth = finished
+    assert run.hindsight is not None
+    robot, beacons = off(run, run.hindsight.track, truth)
+    published, _ = off(run, np.array(run.history.poses), truth)
+    rms = np.sqrt(np.mean(robot**2))
+    assert rms < 0.02  # scans of 60 beams, their walls known to some centimetres
+    assert rms < 0.5 * np.sqrt(np.mean(published**2))
+    assert beacons.max() < 0.03
+    assert not run.found_bias
+
+
+def test_it_is_in_the_published_frame(finished) -> None:
+    run, _ = finished
+    solution = run.hindsight.solution
+    places = dict(zip(solution.nodes, solution.beacons, strict=True))
+    np.testing.assert_allclose(places[run.slots[10], 0], 0.0, atol=1e-9)
+    frame_slots = np.asarray(run.state.frame_slots)
+    assert places[int(frame_slots[1]), 0][1] == pytest.approx(0.0, abs=1e-9)
+    assert places[int(frame_slots[1]), 0][0] > 0
+
+
+def test_the_map_is_drawn_where_the_run_says(finished) -> None:
+    """Occupied cells lie on the walls, once the run is laid over the truth."""
+    run, truth = finished
+    image = run.tiles.image(run.state.grid)
+    row, col = np.nonzero(image.log_odds > 1.0)
+    cells = image.origin + (np.stack([col, row], -1) + 0.5) * image.resolution
+    solution = run.hindsight.solution
+    spots = np.array([BEACONS[node] for node, slot in run.slots.items() if slot > 0])
+    at = [dict(zip(solution.nodes, solution.beacons, strict=True))[slot, 0] for slot in run.slots.values() if slot > 0]
+    a = np.concatenate([run.hindsight.track[:, :2], at])
+    moved = rigid_fit(a, np.concatenate([truth[:, :2], spots])).points(cells)
+    start, along = room.WALLS[:, 0], room.WALLS[:, 1] - room.WALLS[:, 0]
+    share = np.clip(np.sum((moved[:, None] - start) * along, -1) / np.sum(along**2, -1), 0, 1)
+    distance = np.linalg.norm(moved[:, None] - start - share[..., None] * along, axis=-1).min(axis=1)
+    assert len(cells) > 100
+    assert np.mean(distance < 0.1) > 0.95  # a cell
+
+
+def test_biases_are_found_on_the_way_and_mend_the_state(biased) -> None:
+    run, truth = biased
+    told = [text for _, text in run.history.events]
+    assert "beacons and map corrected by the run so far" in told
+    robot, beacons = off(run, run.hindsight.track, truth)
+    assert np.sqrt(np.mean(robot**2)) < 0.02
+    assert beacons.max() < 0.1
+    for node, bias in BIAS.items():
+        assert run.found_bias[0] + run.found_bias[run.slots[node]] == pytest.approx(bias, abs=0.1)
+    # the state itself has them, not only the files
+    last = np.array(run.history.poses)[-50:]
+    late, _ = off(run, last, truth[-50:])
+    assert late.max() < 0.1  # a cell
+
+
+def test_online_and_batch_look_back_to_the_same_bits(biased) -> None:
+    batch, _ = biased
+    online, _ = driven(bias=BIAS, online=True)
+    assert online.history.events == batch.history.events
+    np.testing.assert_array_equal(online.history.poses, batch.history.poses)
+    np.testing.assert_array_equal(online.hindsight.track, batch.hindsight.track)
+    np.testing.assert_array_equal(online.hindsight.solution.beacons, batch.hindsight.solution.beacons)
+    assert_same_bits(online.state, batch.state)
+
+
+def test_the_paper_and_lidar_only_do_not_look_back() -> None:
+    settings = dataclasses.replace(SETTINGS, filter=FilterSettings(preset="paper"), uwb=UwbSettings(max_beacons=3))
+    run, _ = driven(settings)
+    assert run.hindsight is None
+    assert not run.graph.keyframes
+
+
+def test_between_keyframes_a_direction_that_is_not_seen_is_even(finished) -> None:
+    run, _ = finished
+    poses = run.hindsight.solution.poses
+    history = run.history
+    sight, seen = list(history.sight), np.array(history.map_poses)
+    try:
+        key = len(poses) // 2
+        frames = range(run.graph.keyframes[key].frame, run.graph.keyframes[key + 1].frame)
+        for k in frames[1:]:
+            history.sight[k] = float("inf")
+            history.map_poses[k] = history.map_poses[k] + np.array([0.5, -0.5, 0.0])
+        track = _track(run.graph, history, poses)
+        for k in frames[1:]:
+            begin, end = run.graph.keyframes[key].stamp, run.graph.keyframes[key + 1].stamp
+            share = (history.stamps[k] - begin) / (end - begin)
+            want = (1 - share) * poses[key, :2] + share * poses[key + 1, :2]
+            np.testing.assert_allclose(track[k, :2], want, atol=1e-9)
+    finally:
+        for k in frames[1:]:
+            history.sight[k], history.map_poses[k] = sight[k], seen[k]
+    assert np.all(np.abs(wrapped(track[:, 2] - run.hindsight.track[:, 2])) < 1e-9)
