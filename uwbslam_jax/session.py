@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 from collections import Counter
 from collections.abc import Sequence
-from functools import partial
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -20,11 +20,13 @@ from jax import lax
 from uwbslam_jax import beacon_state, layout, ranging, slam, startup
 from uwbslam_jax.beacons import BeaconKeeper
 from uwbslam_jax.calibration import Calibration
-from uwbslam_jax.config import Params, Settings, make_config, make_params
+from uwbslam_jax.config import Config, Params, Settings, UwbSettings, make_config, make_params
+from uwbslam_jax.heard import heard
 from uwbslam_jax.history import History
 from uwbslam_jax.keyframes import Buffer
-from uwbslam_jax.measurements import Frame, StampedFrame
+from uwbslam_jax.measurements import Frame, StampedFrame, empty_frame
 from uwbslam_jax.multilateration import DECIDED
+from uwbslam_jax.packing import Packing
 from uwbslam_jax.slam import Estimate, State
 from uwbslam_jax.tiles import Tiles
 
@@ -39,20 +41,45 @@ _NEWS = 3.0
 """What the whole run tells is taken over when it explains the ranges better by so many times what decides: its poses
 are not independent of each other, though they are taken to be."""
 
+_loudness = jax.jit(ranging.loudness)
+
 TRACES: Counter[str] = Counter()
 """How often each compiled function was traced, by name; a test counts them."""
 
 
+def step_once(config: Config, params: Params, state: State, frame: Frame) -> tuple[State, Estimate]:
+    """One compiled step; the state's buffers are reused. The estimate is on the host."""
+    frames, estimates = _packings(config)
+    state, told = _step_once(config, params, state, frames.pack(frame))
+    return state, estimates.unpack(np.asarray(told))
+
+
+def step_many(
+    config: Config, params: Params, state: State, frames: Sequence[Frame]
+) -> tuple[State, list[Estimate]]:
+    """Steps over frames in order, as one compiled scan."""
+    packing, estimates = _packings(config)
+    state, told = _step_many(config, params, state, np.stack([packing.pack(frame) for frame in frames]))
+    return state, [estimates.unpack(row) for row in np.asarray(told)]
+
+
+@cache
+def _packings(config: Config) -> tuple[Packing[Frame], Packing[Estimate]]:
+    """How the frames and the estimates of a configuration lie in vectors."""
+    frame, state = empty_frame(config.max_beams, config.max_ranges), jax.eval_shape(partial(slam.init, config))
+    params = jax.eval_shape(lambda: make_params(Settings(uwb=UwbSettings(max_beacons=config.nodes - 1))))
+    _, estimate = jax.eval_shape(partial(slam.step, config), params, state, frame)
+    return Packing(frame), Packing(estimate)
+
+
 @partial(jax.jit, static_argnums=0, donate_argnums=2)
-def step_once(config, params, state: State, frame: Frame) -> tuple[State, Estimate]:
-    """One compiled step; the state's buffers are reused."""
+def _step_once(config, params, state, frame):
     TRACES["step_once"] += 1
     return _guarded(config, params, state, frame)
 
 
 @partial(jax.jit, static_argnums=0, donate_argnums=2)
-def step_many(config, params, state: State, frames: Frame) -> tuple[State, Estimate]:
-    """Steps over frames stacked along their first axis, as one compiled scan."""
+def _step_many(config, params, state, frames):
     TRACES["step_many"] += 1
     return lax.scan(lambda s, f: _guarded(config, params, s, f), state, frames)
 
@@ -60,7 +87,9 @@ def step_many(config, params, state: State, frames: Frame) -> tuple[State, Estim
 def _guarded(config, params, state, frame):
     # without the barriers the compiler fuses the step with the loop around it and rounds differently there
     state, frame = lax.optimization_barrier((state, frame))
-    return lax.optimization_barrier(slam.step(config, params, state, frame))
+    frames, estimates = _packings(config)
+    state, estimate = lax.optimization_barrier(slam.step(config, params, state, frames.unpack(frame)))
+    return state, estimates.pack_device(estimate)
 
 
 class Session:
@@ -94,6 +123,7 @@ class Session:
         self._keeper = BeaconKeeper(settings)
         self._calibration = Calibration(settings.uwb.sigma_n)
         self._calibrated_at = 0
+        self._copied: tuple[Params | None, Params] = (None, self.params)
 
     @property
     def slots(self) -> dict[int, int]:
@@ -108,7 +138,6 @@ class Session:
         """One frame in, its estimate out (numpy)."""
         self._learn_slots(frame)
         self.state, estimate = step_once(self.config, self.params, self.state, frame.frame)
-        estimate = jax.device_get(estimate)
         self._take(frame, estimate)
         return estimate
 
@@ -117,10 +146,7 @@ class Session:
         if len(frames) != CONTROL_EVERY or self._pending:
             return [self.step(frame) for frame in frames]
         self._learn_slots(frames[-1])
-        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *[f.frame for f in frames])
-        self.state, many = step_many(self.config, self.params, self.state, stacked)
-        many = jax.device_get(many)
-        estimates = [jax.tree.map(lambda leaf, k=k: leaf[k], many) for k in range(len(frames))]
+        self.state, estimates = step_many(self.config, self.params, self.state, [f.frame for f in frames])
         for frame, estimate in zip(frames, estimates, strict=True):
             self._take(frame, estimate)
         return estimates
@@ -161,7 +187,7 @@ class Session:
                 self._start_up(pending)
             else:
                 self._keep_beacons(pending)
-        robot = np.asarray(self.state.belief.mean[:2], float)
+        robot = np.asarray(self.state.belief.mean)[:2].astype(float)
         origin = np.asarray(self.state.grid.origin, float)
         if self.tiles.needs_move(origin, self.config.cells, robot):
             self.state = self.state._replace(grid=self.tiles.recentre(self.state.grid, robot))
@@ -198,19 +224,24 @@ class Session:
 
     def _keep_beacons(self, pending: list[tuple[StampedFrame, Estimate]]) -> None:
         ids = {slot: node for node, slot in self._slots.items()}
-        self.state, events = self._keeper.look(self.state, self.params, pending)
+        params = self._params_on_host()
+        ranges = heard(pending, params)
+        self.state, events = self._keeper.look(self.state, ranges, pending)
         for slot, text in events:
             who = "robot" if slot == 0 else f"beacon {ids[slot]}"
             self.history.event(pending[-1][0].stamp, f"{who} {text}")
             if slot > 0:
                 self._calibration.forget(slot)
-        loudness = np.asarray(ranging.loudness(self.state.scatter.log))
-        for frame, estimate in pending:
-            self._calibration.hear(frame, estimate, self.params, loudness)
+        self._calibration.hear(ranges, params, np.asarray(_loudness(self.state.scatter.log)))
         now = pending[-1][0].stamp
         if now - self._calibrated_at > _CALIBRATE_EVERY_S * 1e9:
             self._calibrated_at = now
             self._calibrate(now)
+
+    def _params_on_host(self) -> Params:
+        if self._copied[0] is not self.params:
+            self._copied = (self.params, jax.device_get(self.params))
+        return self._copied[1]
 
     def _calibrate(self, now: int) -> None:
         """Take over what the whole run tells of the beacons and their biases, where the state's contradict it."""

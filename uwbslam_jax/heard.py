@@ -1,0 +1,82 @@
+"""The ranges of some frames in flat arrays, with what the steps made of them: what the host looks at between steps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from uwbslam_jax.config import Params
+from uwbslam_jax.measurements import StampedFrame
+from uwbslam_jax.slam import Estimate
+
+
+class Heard(NamedTuple):
+    """R valid ranges in order of their frames.
+
+    Attributes:
+      frame: (R,) number of the frame.
+      stamp: (R,) of the frame, int64 [ns]. age: (R,) of the range relative to it [s].
+      i, j: (R,) slots.
+      range: (R,) as measured [m]. flat: (R,) in the plane, biases and heights taken off [m].
+      power_gap: (R,) [dB].
+      weight, normalised: (R,) see Estimate.
+      antenna: (R, 2) where the robot's antenna was [m]. variance: (R,) of the robot's x and y, their mean [m^2].
+      rests_i, rests_j: (R,) whether the node is in the state and not carried.
+    """
+
+    frame: np.ndarray
+    stamp: np.ndarray
+    age: np.ndarray
+    i: np.ndarray
+    j: np.ndarray
+    range: np.ndarray
+    flat: np.ndarray
+    power_gap: np.ndarray
+    weight: np.ndarray
+    normalised: np.ndarray
+    antenna: np.ndarray
+    variance: np.ndarray
+    rests_i: np.ndarray
+    rests_j: np.ndarray
+
+
+def heard(pending: Sequence[tuple[StampedFrame, Estimate]], params: Params) -> Heard:
+    """The valid ranges of some frames and their estimates, all on the host."""
+    valid = np.stack([frame.frame.ranges.valid for frame, _ in pending])
+    f, k = np.nonzero(valid)
+
+    def of_ranges(name: str) -> np.ndarray:
+        return np.stack([getattr(frame.frame.ranges, name) for frame, _ in pending])[f, k]
+
+    def of_estimates(name: str) -> np.ndarray:
+        return np.stack([getattr(estimate, name) for _, estimate in pending])
+
+    i, j, age = of_ranges("i"), of_ranges("j"), of_ranges("age").astype(float)
+    pose, velocity = of_estimates("pose").astype(float)[f], of_estimates("velocity").astype(float)[f]
+    heading = pose[:, 2] + of_estimates("yaw_rate").astype(float)[f] * age
+    x, y = np.asarray(params.antenna, float)
+    c, s = np.cos(heading), np.sin(heading)
+    lever = np.stack([c * x - s * y, s * x + c * y], axis=1)
+    height, bias = np.asarray(params.height, float), np.asarray(params.bias, float)
+    measured = of_ranges("range").astype(float)
+    slant = (measured - bias[i] - bias[j]) / (1.0 + float(params.bias_scale))
+    rests = of_estimates("active") & ~of_estimates("moving")
+    cov = of_estimates("pose_cov").astype(float)
+    return Heard(
+        frame=f,
+        stamp=np.array([frame.stamp for frame, _ in pending], np.int64)[f],
+        age=age,
+        i=i,
+        j=j,
+        range=measured,
+        flat=np.sqrt(np.maximum(slant**2 - (height[i] - height[j]) ** 2, 0.01)),
+        power_gap=of_ranges("power_gap"),
+        weight=of_estimates("weight")[f, k],
+        normalised=of_estimates("normalised").astype(float)[f, k],
+        antenna=pose[:, :2] + age[:, None] * velocity + lever,
+        variance=(cov[:, 0, 0] + cov[:, 1, 1])[f] / 2,
+        rests_i=rests[f, i],
+        rests_j=rests[f, j],
+    )
