@@ -20,8 +20,10 @@ _MOVES = (6, 5, 5)
 """Gauss-Newton moves at the finest, middle and every coarser level, at most."""
 _STILL = 0.01
 """A level is done when a move is shorter than this many of its cells [cells of m or rad]."""
+_ALIGNED_BEAMS = 540
+"""More beams than this do not place a scan better: neighbours hit the same cell."""
 _THIN_BEAMS = 360
-"""What only steers or checks (coarser levels, the fit of an expected pose) needs no more beams than this."""
+"""What only steers or checks (coarser levels, the fit of an expected pose) needs no more than this."""
 _NEIGHBOURS = (1, 2, 4, 8, 16)
 _NORMAL_SPAN = (0.25, 1.0)
 """A normal needs neighbours this far apart [m]."""
@@ -202,12 +204,11 @@ def gauss_newton(residual, start, args, moves: int, still: float = 0.0):
     return solution.value
 
 
-def thinned(sweep: Sweep, surface: Surface) -> tuple[Sweep, Surface]:
-    """Every so manieth beam, so that there are some hundreds. As they are where there are no more."""
-    n = max(1, sweep.valid.shape[0] // _THIN_BEAMS)
+def thinned(sweep: Sweep, most: int = _THIN_BEAMS) -> Sweep:
+    """Every so manieth beam, so that there are about as many as asked for."""
+    n = max(1, sweep.valid.shape[0] // most)
     few = sweep._replace(points=sweep.points[::n], valid=sweep.valid[::n], reach=sweep.reach[::n])
-    few = few._replace(bearing_step=n * sweep.bearing_step)
-    return few, Surface(surface.tangent[:, ::n], surface.found[::n])
+    return few._replace(bearing_step=n * sweep.bearing_step)
 
 
 def align(
@@ -227,9 +228,9 @@ def align(
     """
     root = jnp.linalg.inv(symmetric_root(prior.cov))
     projector = seen(blind, start[2])
-    few, _ = thinned(sweep, Surface(sweep.points.T, sweep.valid))
 
-    def at_level(k: int, beams: Sweep, pose):
+    def at_level(k: int, pose):
+        beams = thinned(sweep, _ALIGNED_BEAMS if k == 0 else _THIN_BEAMS)
         size = jnp.asarray(resolution * 2**k, pose.dtype)
         # fewer beams weigh as much as all of them
         weight = jnp.sqrt(jnp.asarray(beams.valid.shape[0] / sweep.valid.shape[0], pose.dtype))
@@ -239,10 +240,10 @@ def align(
 
     def coarse(pose):
         for k in reversed(range(1, len(grid.levels))):
-            pose = at_level(k, few, pose)
+            pose = at_level(k, pose)
         return pose
 
-    return at_level(0, sweep, jax.lax.cond(near, lambda pose: pose, coarse, start))
+    return at_level(0, jax.lax.cond(near, lambda pose: pose, coarse, start))
 
 
 def assess(grid: Grid, sweep: Sweep, surface: Surface, pose: Float[Array, "3"], resolution: float) -> Match:
@@ -253,9 +254,9 @@ def assess(grid: Grid, sweep: Sweep, surface: Surface, pose: Float[Array, "3"], 
     """
     gram = lidar_gram(pose, grid.levels[0], grid.origin, resolution, sweep.points, sweep.valid)
     score, known = fit(grid, sweep, pose, resolution)
-    few, few_surface = thinned(sweep, surface)
-    on_wall, _ = on_known_wall(grid, transform_points(pose, few.points), resolution, min(1, len(grid.levels) - 1))
-    informed = seen(blind_direction(few_surface, few.valid & on_wall), pose[2])
+    ends = transform_points(pose, sweep.points)
+    on_wall, _ = on_known_wall(grid, ends, resolution, min(1, len(grid.levels) - 1))
+    informed = seen(blind_direction(surface, sweep.valid & on_wall), pose[2])
     projector = jnp.eye(3).at[:2, :2].set(informed)
     information = projector @ gram[:3, :3] @ projector
     return Match(pose, information, informed, score, known)

@@ -189,7 +189,7 @@ def _match_and_fuse(config, params, state, belief, frame, sweep, surface, usable
     lost = (match.known > _KNOWN_ENOUGH) & (match.score < _LOST_SCORE)
     lost = lost | (searched & (match.known < _FOUND_KNOWN))
     sure = trust.is_sure(match) & frame.has_scan
-    needed = trust.needs_jump(match, _expected_fit(config, state, belief, sweep, surface))
+    needed = trust.needs_jump(match, _expected_fit(config, state, belief, sweep))
     learning = sure & ~frame.odometry.valid
     unrest = jnp.where(learning, trust.learn_unrest(state.unrest, match, belief, needed), state.unrest)
     credible = sure & (needed | trust.restless(state.unrest))
@@ -207,8 +207,8 @@ def _match_and_fuse(config, params, state, belief, frame, sweep, surface, usable
     return belief, _Matched(match, information, poor & frame.has_scan, searched, trusted, unrest, spread)
 
 
-def _expected_fit(config, state, belief, sweep, surface) -> Float[Array, ""]:
-    few, _ = matching.thinned(sweep, surface)
+def _expected_fit(config, state, belief, sweep) -> Float[Array, ""]:
+    few = matching.thinned(sweep)
     score, known = matching.fit(state.grid, few, trust.expected_match(belief), config.resolution)
     return score * known
 
