@@ -13,8 +13,8 @@ import jax
 import numpy as np
 
 from uwbslam_jax import beacon_state, layout, ranging
-from uwbslam_jax.config import Settings
-from uwbslam_jax.heard import Heard
+from uwbslam_jax.config import Params, Settings
+from uwbslam_jax.heard import Heard, heard
 from uwbslam_jax.measurements import StampedFrame
 from uwbslam_jax.multilateration import locate
 from uwbslam_jax.sightings import (
@@ -115,11 +115,11 @@ class BeaconKeeper:
         return (stamp - self._start) / 1e9
 
     def look(
-        self, state: State, ranges: Heard, pending: list[tuple[StampedFrame, Estimate]]
+        self, state: State, params: Params, pending: list[tuple[StampedFrame, Estimate]]
     ) -> tuple[State, list[Event]]:
-        """The state after what a few frames and their ranges told about the beacons, and what happened to which slot."""
+        """The state after what a few frames told about the beacons, and what happened to which slot."""
         self._seconds(pending[0][0].stamp)  # time counts from the first frame
-        self._listen(ranges)
+        self._listen(heard(pending, params))
         span = self._seconds(pending[-1][0].stamp) - self._seconds(pending[0][0].stamp)
         now = self._seconds(pending[-1][0].stamp)
         share, found = self._find_carried_robot(state, self._known(state, now, 0))

@@ -14,9 +14,11 @@ from typing import NamedTuple
 import numpy as np
 
 from uwbslam_jax.config import Params
-from uwbslam_jax.heard import Heard
+from uwbslam_jax.heard import antenna_at
+from uwbslam_jax.measurements import StampedFrame
 from uwbslam_jax.multilateration import DECIDED, soften
 from uwbslam_jax.placement import CALIBRATED_M, largest_sigma
+from uwbslam_jax.slam import Estimate
 
 BIAS_M = 0.3
 """Prior spread of a node's bias [m]."""
@@ -86,23 +88,22 @@ class Calibration:
         for pair in [pair for pair in self._pairs if slot in pair]:
             del self._pairs[pair]
 
-    def hear(self, ranges: Heard, params: Params, loudness: np.ndarray) -> None:
-        """Some frames' ranges, of which those that were used count. loudness: (K, K) of the pairs, see ranging."""
-        i, j = np.minimum(ranges.i, ranges.j), np.maximum(ranges.i, ranges.j)
-        rest = (ranges.rests_i | (ranges.i == 0)) & (ranges.rests_j | (ranges.j == 0))
-        used = np.flatnonzero((ranges.weight > 0) & rest & (loudness[i, j] <= _QUIET))
-        if not len(used):
-            return
-        by_robot = i[used] == 0
-        place = np.where(by_robot[:, None], ranges.antenna[used] // _PLACE_M, 0.0).astype(int)
-        distance = ranges.range[used] / (1.0 + float(params.bias_scale))
-        values = np.column_stack([np.ones(len(used)), ranges.antenna[used], distance, ranges.variance[used]])
-        values[~by_robot, 1:3] = values[~by_robot, 4] = 0.0
-        keys, which = np.unique(np.column_stack([i[used], j[used], place]), axis=0, return_inverse=True)
-        sums = np.zeros((len(keys), values.shape[1]))
-        np.add.at(sums, which.ravel(), values)
-        for (a, b, *key), total in zip(keys.tolist(), sums.tolist(), strict=True):
-            _add(self._robot[b][key[0], key[1]] if a == 0 else self._pairs[a, b], *total)
+    def hear(self, frame: StampedFrame, estimate: Estimate, params: Params, loudness: np.ndarray) -> None:
+        """One frame's ranges that were used. loudness: (K, K) of the pairs, see ranging."""
+        r = frame.frame.ranges
+        resting = np.asarray(estimate.active) & ~np.asarray(estimate.moving)
+        sigma = float(np.trace(estimate.pose_cov[:2, :2])) / 2
+        for k in np.flatnonzero(np.asarray(estimate.weight) > 0):
+            i, j = sorted((int(r.i[k]), int(r.j[k])))
+            if not (resting[j] and (i == 0 or resting[i])) or loudness[i, j] > _QUIET:
+                continue
+            distance = float(r.range[k]) / (1.0 + float(params.bias_scale))
+            if i > 0:
+                _add(self._pairs[i, j], np.zeros(2), distance, 0.0)
+                continue
+            at = antenna_at(estimate, np.asarray(r.age[k : k + 1], float), params)[0]
+            key = int(at[0] // _PLACE_M), int(at[1] // _PLACE_M)
+            _add(self._robot[j][key], at, distance, sigma)
 
     def solve(self, places: np.ndarray, found: dict[int, float], configured: Params) -> Solution | None:
         """Beacons, and biases where those explain the ranges far better than none; None where too little was ranged.
@@ -145,9 +146,9 @@ class Calibration:
         return _Problem(len(slots), np.array(rows), np.array(pairs).reshape(-1, 5))
 
 
-def _add(mean: _Mean, count: float, x: float, y: float, distance: float, variance: float) -> None:
-    mean.count += int(count)
-    mean.x, mean.y = mean.x + x, mean.y + y
+def _add(mean: _Mean, at: np.ndarray, distance: float, variance: float) -> None:
+    mean.count += 1
+    mean.x, mean.y = mean.x + at[0], mean.y + at[1]
     mean.distance, mean.variance = mean.distance + distance, mean.variance + variance
 
 

@@ -19,10 +19,10 @@ class Heard(NamedTuple):
       frame: (R,) number of the frame.
       stamp: (R,) of the frame, int64 [ns]. age: (R,) of the range relative to it [s].
       i, j: (R,) slots.
-      range: (R,) as measured [m]. flat: (R,) in the plane, biases and heights taken off [m].
+      flat: (R,) distance in the plane, biases and heights taken off [m].
       power_gap: (R,) [dB].
-      weight, normalised: (R,) see Estimate.
-      antenna: (R, 2) where the robot's antenna was [m]. variance: (R,) of the robot's x and y, their mean [m^2].
+      normalised: (R,) see Estimate.
+      antenna: (R, 2) where the robot's antenna was [m].
       rests_i, rests_j: (R,) whether the node is in the state and not carried.
     """
 
@@ -31,13 +31,10 @@ class Heard(NamedTuple):
     age: np.ndarray
     i: np.ndarray
     j: np.ndarray
-    range: np.ndarray
     flat: np.ndarray
     power_gap: np.ndarray
-    weight: np.ndarray
     normalised: np.ndarray
     antenna: np.ndarray
-    variance: np.ndarray
     rests_i: np.ndarray
     rests_j: np.ndarray
 
@@ -54,29 +51,33 @@ def heard(pending: Sequence[tuple[StampedFrame, Estimate]], params: Params) -> H
         return np.stack([getattr(estimate, name) for _, estimate in pending])
 
     i, j, age = of_ranges("i"), of_ranges("j"), of_ranges("age").astype(float)
-    pose, velocity = of_estimates("pose").astype(float)[f], of_estimates("velocity").astype(float)[f]
-    heading = pose[:, 2] + of_estimates("yaw_rate").astype(float)[f] * age
-    x, y = np.asarray(params.antenna, float)
-    c, s = np.cos(heading), np.sin(heading)
-    lever = np.stack([c * x - s * y, s * x + c * y], axis=1)
+    pose, velocity, yaw_rate = (of_estimates(name).astype(float)[f] for name in ("pose", "velocity", "yaw_rate"))
     height, bias = np.asarray(params.height, float), np.asarray(params.bias, float)
-    measured = of_ranges("range").astype(float)
-    slant = (measured - bias[i] - bias[j]) / (1.0 + float(params.bias_scale))
+    slant = (of_ranges("range").astype(float) - bias[i] - bias[j]) / (1.0 + float(params.bias_scale))
     rests = of_estimates("active") & ~of_estimates("moving")
-    cov = of_estimates("pose_cov").astype(float)
     return Heard(
         frame=f,
         stamp=np.array([frame.stamp for frame, _ in pending], np.int64)[f],
         age=age,
         i=i,
         j=j,
-        range=measured,
         flat=np.sqrt(np.maximum(slant**2 - (height[i] - height[j]) ** 2, 0.01)),
         power_gap=of_ranges("power_gap"),
-        weight=of_estimates("weight")[f, k],
         normalised=of_estimates("normalised").astype(float)[f, k],
-        antenna=pose[:, :2] + age[:, None] * velocity + lever,
-        variance=(cov[:, 0, 0] + cov[:, 1, 1])[f] / 2,
+        antenna=_antenna(pose, velocity, yaw_rate, age, params),
         rests_i=rests[f, i],
         rests_j=rests[f, j],
     )
+
+
+def antenna_at(estimate: Estimate, age: np.ndarray, params: Params) -> np.ndarray:
+    """(R, 2) where the robot's antenna was at each exchange around one estimate [m]."""
+    pose, velocity = np.asarray(estimate.pose, float)[None], np.asarray(estimate.velocity, float)
+    return _antenna(pose, velocity, float(estimate.yaw_rate), age, params)
+
+
+def _antenna(pose, velocity, yaw_rate, age, params) -> np.ndarray:
+    heading = pose[:, 2] + yaw_rate * age
+    x, y = np.asarray(params.antenna, float)
+    c, s = np.cos(heading), np.sin(heading)
+    return pose[:, :2] + age[:, None] * velocity + np.stack([c * x - s * y, s * x + c * y], axis=1)

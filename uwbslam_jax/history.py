@@ -67,6 +67,7 @@ class History:
       diagnostics: one entry a frame by name.
       residuals: (t, slot, slot, measured minus predicted); tracks: (t, slot, x, y, sigma).
       events: (stamp, text).
+      left: beacons as they were when one of them last left the state, see `beacons`.
       last_scan: number, frame and estimate of the last frame that had a scan.
     """
 
@@ -81,19 +82,19 @@ class History:
         self.events: list[tuple[int, str]] = []
         self.last_scan: tuple[int, StampedFrame, Estimate] | None = None
         self._residuals_at = self._tracks_at = 0
-        self._beacons: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self.left: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         self._seen: Estimate | None = None
 
     @property
     def beacons(self) -> dict[int, tuple[np.ndarray, np.ndarray]]:
         """Slot -> position (2,) [m] and covariance (2, 2) [m^2] when it was last in the state."""
         self._keep_beacons()
-        return self._beacons
+        return self.left
 
     def _keep_beacons(self) -> None:
         if self._seen is not None:
             for slot in np.flatnonzero(self._seen.active[1:]) + 1:
-                self._beacons[int(slot)] = self._seen.beacons[slot].copy(), self._seen.beacon_covs[slot].copy()
+                self.left[int(slot)] = self._seen.beacons[slot].copy(), self._seen.beacon_covs[slot].copy()
 
     @property
     def diagnostics(self) -> dict[str, np.ndarray]:

@@ -18,12 +18,12 @@ from uwbslam_jax.objective import lidar_gram, lidar_residual, prior_residual
 
 _MOVES = (6, 5, 5)
 """Gauss-Newton moves at the finest, middle and every coarser level, at most."""
-_STILL = 0.01
+_STILL = 0.005
 """A level is done when a move is shorter than this many of its cells [cells of m or rad]."""
-_ALIGNED_BEAMS = 540
-"""More beams than this do not place a scan better: neighbours hit the same cell."""
-_THIN_BEAMS = 360
-"""What only steers or checks (coarser levels, the fit of an expected pose) needs no more than this."""
+_NEARBY_BEAMS = 540
+"""A scan that is nearly in place needs no more beams than this: neighbours hit the same cell."""
+_CHECKED_BEAMS = 360
+"""And more than this do not tell how well it fits where it was expected."""
 _NEIGHBOURS = (1, 2, 4, 8, 16)
 _NORMAL_SPAN = (0.25, 1.0)
 """A normal needs neighbours this far apart [m]."""
@@ -204,7 +204,7 @@ def gauss_newton(residual, start, args, moves: int, still: float = 0.0):
     return solution.value
 
 
-def thinned(sweep: Sweep, most: int = _THIN_BEAMS) -> Sweep:
+def thinned(sweep: Sweep, most: int = _CHECKED_BEAMS) -> Sweep:
     """Every so manieth beam, so that there are about as many as asked for."""
     n = max(1, sweep.valid.shape[0] // most)
     few = sweep._replace(points=sweep.points[::n], valid=sweep.valid[::n], reach=sweep.reach[::n])
@@ -224,13 +224,13 @@ def align(
     """Pose that minimises 1/2 sum (1 - Gamma)^2 / sigma_l^2 + the prior's quadratic, coarse to fine (DESIGN 1.4).
 
     Args:
-      near: the start is within a cell of the answer: the coarser levels would only lead away from it and back.
+      near: the start is within a cell of the answer: the coarser levels would only lead away from it and back, and
+        fewer beams will do.
     """
     root = jnp.linalg.inv(symmetric_root(prior.cov))
     projector = seen(blind, start[2])
 
-    def at_level(k: int, pose):
-        beams = thinned(sweep, _ALIGNED_BEAMS if k == 0 else _THIN_BEAMS)
+    def at_level(k: int, beams: Sweep, pose):
         size = jnp.asarray(resolution * 2**k, pose.dtype)
         # fewer beams weigh as much as all of them
         weight = jnp.sqrt(jnp.asarray(beams.valid.shape[0] / sweep.valid.shape[0], pose.dtype))
@@ -238,12 +238,15 @@ def align(
         args = _LidarAndPrior(*scan, prior.mean, root, sigma_l * weight, projector)
         return gauss_newton(_residual, pose, args, _MOVES[min(k, 2)], _STILL * resolution * 2**k)
 
-    def coarse(pose):
-        for k in reversed(range(1, len(grid.levels))):
-            pose = at_level(k, pose)
+    def from_afar(pose):
+        for k in reversed(range(len(grid.levels))):
+            pose = at_level(k, sweep, pose)
         return pose
 
-    return at_level(0, jax.lax.cond(near, lambda pose: pose, coarse, start))
+    def from_nearby(pose):
+        return at_level(0, thinned(sweep, _NEARBY_BEAMS), pose)
+
+    return jax.lax.cond(near, from_nearby, from_afar, start)
 
 
 def assess(grid: Grid, sweep: Sweep, surface: Surface, pose: Float[Array, "3"], resolution: float) -> Match:

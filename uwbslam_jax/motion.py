@@ -149,6 +149,6 @@ def _bounded(cov: Float[Array, "n n"], k: int) -> Float[Array, "n n"]:
     """The robot's velocity, yaw rate and heading at most as uncertain as such a robot's can be."""
     most = np.zeros(cov.shape[0], np.float32)
     most[[2 * k, 2 * k + 1, 4 * k + 1, 4 * k]] = np.array([_FASTEST[0], *_FASTEST]) ** 2
-    shrink = jnp.sqrt(jnp.minimum(1.0, most / jnp.diagonal(cov)))
-    scale = jnp.where(most > 0, shrink, 1.0)
+    ratio = jnp.where(most > 0, most / jnp.diagonal(cov), 1.0)
+    scale = jnp.sqrt(jnp.minimum(1.0, ratio))
     return cov * (scale[:, None] * scale[None, :])

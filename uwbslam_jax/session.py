@@ -21,7 +21,6 @@ from uwbslam_jax import beacon_state, layout, ranging, slam, startup
 from uwbslam_jax.beacons import BeaconKeeper
 from uwbslam_jax.calibration import Calibration
 from uwbslam_jax.config import Config, Params, Settings, UwbSettings, make_config, make_params
-from uwbslam_jax.heard import heard
 from uwbslam_jax.history import History
 from uwbslam_jax.keyframes import Buffer
 from uwbslam_jax.measurements import Frame, StampedFrame, empty_frame
@@ -54,9 +53,7 @@ def step_once(config: Config, params: Params, state: State, frame: Frame) -> tup
     return state, estimates.unpack(np.asarray(told))
 
 
-def step_many(
-    config: Config, params: Params, state: State, frames: Sequence[Frame]
-) -> tuple[State, list[Estimate]]:
+def step_many(config: Config, params: Params, state: State, frames: Sequence[Frame]) -> tuple[State, list[Estimate]]:
     """Steps over frames in order, as one compiled scan."""
     packing, estimates = _packings(config)
     state, told = _step_many(config, params, state, np.stack([packing.pack(frame) for frame in frames]))
@@ -225,14 +222,15 @@ class Session:
     def _keep_beacons(self, pending: list[tuple[StampedFrame, Estimate]]) -> None:
         ids = {slot: node for node, slot in self._slots.items()}
         params = self._params_on_host()
-        ranges = heard(pending, params)
-        self.state, events = self._keeper.look(self.state, ranges, pending)
+        self.state, events = self._keeper.look(self.state, params, pending)
         for slot, text in events:
             who = "robot" if slot == 0 else f"beacon {ids[slot]}"
             self.history.event(pending[-1][0].stamp, f"{who} {text}")
             if slot > 0:
                 self._calibration.forget(slot)
-        self._calibration.hear(ranges, params, np.asarray(_loudness(self.state.scatter.log)))
+        loudness = np.asarray(_loudness(self.state.scatter.log))
+        for frame, estimate in pending:
+            self._calibration.hear(frame, estimate, params, loudness)
         now = pending[-1][0].stamp
         if now - self._calibrated_at > _CALIBRATE_EVERY_S * 1e9:
             self._calibrated_at = now
