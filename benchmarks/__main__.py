@@ -1,4 +1,4 @@
-"""Speed: `python -m benchmarks NAME` measures one thing, writes results/NAME.md and NAME.json and prints the table.
+"""Speed: `python -m benchmarks NAME` measures one thing, writes results/NAME.md and .json and prints the table.
 
 With --gate the exit status is 1 where a figure misses its bar, or a ratio is worse than the committed baseline's by more
 than its tolerance; --baseline puts this run's ratios into the baseline. How far off the answers are is

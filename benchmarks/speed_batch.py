@@ -1,4 +1,4 @@
-"""`uwbslam run` over ten minutes at 40 Hz, end to end, its peak memory against a log of an hour; many parameter sets."""
+"""`uwbslam run` over ten minutes at 40 Hz, end to end, its peak memory; many parameter sets at once."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def measure(*, quick: bool) -> Report:
     about = (
         "`uwbslam run` as a user calls it, in a process of its own with a warm compilation cache, on the hall at 40 Hz "
         "(1081 beams, five beacons, all pairs): from the shell to the last file. Reading: the recording decoded and made "
-        "into frames by itself. Parameter sets: the same twenty steps for different noise parameters by one vmap."
+        "into frames by itself. Parameter sets: the same twenty steps for other noise parameters by one vmap."
     )
     return Report("Whole recordings", about, metrics)
 

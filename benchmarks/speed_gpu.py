@@ -39,6 +39,4 @@ def measure(*, quick: bool) -> Report:
     device = jax.devices()[0].device_kind
     told = [Metric(f"{n} runs, a step of one", 1e6 * t / n / _STEPS, "us", "lower") for n, t in times.items()]
     most = max(times)
-    return Report(
-        _TITLE, f"{about} Device: {device}.", [*told, ratio(f"{most} runs / one", times[most] / times[1])]
-    )
+    return Report(_TITLE, f"{about} Device: {device}.", [*told, ratio(f"{most} runs / one", times[most] / times[1])])

@@ -50,7 +50,7 @@ def measure(*, quick: bool) -> Report:
     times = _take_turns([Case(5, replace(usual, map=MapSettings(size_m=25.6, levels=k))) for k in LEVELS], count)
     metrics += [Metric(f"step, {k} levels", 1e3 * t, "ms", "lower") for k, t in zip(LEVELS, times, strict=True)]
     about = (
-        "Compiled steps at 10 Hz (coarser levels and drawing at work) on a robot that circles in a room of 12 x 8 m, all "
+        "Compiled steps at 10 Hz (coarser levels and drawing at work), a robot that circles in a room of 12 x 8 m, all "
         "pairs of nodes ranged in every frame. Cases that are compared take turns step by step. The window is all that "
         "the device holds of a map; what lies outside is kept in tiles on the host."
     )
@@ -103,7 +103,6 @@ class Case:
         self.state, _ = session.step_once(self._config, self._params, self.state, frame)
         jax.block_until_ready(self.state)
         return time.perf_counter() - begin
-
 
     def many(self, sets: int, frames: list[Frame]) -> Callable[[], Any]:
         """The frames stepped for so many parameter sets at once, each with its own noise of ranges."""

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import optimistix as optx
+from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
 from uwbslam_jax import grid as occupancy
@@ -22,6 +23,8 @@ _STILL = 0.005
 """A level is done when a move is shorter than this many of its cells [cells of m or rad]."""
 _NEARBY_BEAMS = 540
 """A scan that is nearly in place needs no more beams than this: neighbours hit the same cell."""
+_NEARBY_MOVES, _NEARBY_STILL = 3, 0.02
+"""Nor more moves, and what its last is shorter than [cells of m or rad]."""
 _CHECKED_BEAMS = 360
 """And more than this do not tell how well it fits where it was expected."""
 _NEIGHBOURS = (1, 2, 4, 8, 16)
@@ -179,8 +182,8 @@ def _residual(pose: Float[Array, "3"], a: _LidarAndPrior) -> Float[Array, "7"]:
 class _GaussNewton(optx.GaussNewton):
     """Gauss-Newton that stops by the length of a move alone, and takes that move.
 
-    Optimistix also waits until no entry of the residual changes any more, which ours never do: where the pose is right,
-    the entries of a Gram matrix's root pass through zero. And it evaluates once more after the last move.
+    Optimistix also waits until no entry of the residual changes any more, which those of a Gram matrix's root never do:
+    where the pose is right they pass through zero. And it evaluates once more after the last move.
     """
 
     def terminate(self, fn, y, args, options, state, tags):
@@ -192,11 +195,8 @@ class _GaussNewton(optx.GaussNewton):
 
 
 def gauss_newton(residual, start, args, moves: int, still: float = 0.0):
-    """Least squares by `moves` Gauss-Newton moves of optimistix at most; never raises, returns the last iterate.
-
-    Args:
-      still: a move of which every coordinate is shorter than this is the last.
-    """
+    """Least squares by `moves` Gauss-Newton moves of optimistix at most; never raises, returns the last iterate. A move
+    of which every coordinate is shorter than `still` is the last."""
     solver = _GaussNewton(rtol=0.0, atol=still, linear_solver=lx.Normal(lx.Cholesky()))
     solution = optx.least_squares(
         residual, solver, start, args=args, max_steps=moves, throw=False, adjoint=optx.RecursiveCheckpointAdjoint()
@@ -205,7 +205,7 @@ def gauss_newton(residual, start, args, moves: int, still: float = 0.0):
 
 
 def thinned(sweep: Sweep, most: int = _CHECKED_BEAMS) -> Sweep:
-    """Every so manieth beam, so that there are about as many as asked for."""
+    """Every so manieth beam, about as many as asked for."""
     n = max(1, sweep.valid.shape[0] // most)
     few = sweep._replace(points=sweep.points[::n], valid=sweep.valid[::n], reach=sweep.reach[::n])
     return few._replace(bearing_step=n * sweep.bearing_step)
@@ -227,24 +227,24 @@ def align(
       near: the start is within a cell of the answer: the coarser levels would only lead away from it and back, and
         fewer beams will do.
     """
-    root = jnp.linalg.inv(symmetric_root(prior.cov))
+    root = solve_triangular(symmetric_root(prior.cov), jnp.eye(3, dtype=start.dtype), lower=True)
     projector = seen(blind, start[2])
 
-    def at_level(k: int, beams: Sweep, pose):
+    def at_level(k: int, beams: Sweep, pose, moves: int, still: float):
         size = jnp.asarray(resolution * 2**k, pose.dtype)
         # fewer beams weigh as much as all of them
         weight = jnp.sqrt(jnp.asarray(beams.valid.shape[0] / sweep.valid.shape[0], pose.dtype))
         scan = (grid.levels[k], grid.origin, size, beams.points, beams.valid)
         args = _LidarAndPrior(*scan, prior.mean, root, sigma_l * weight, projector)
-        return gauss_newton(_residual, pose, args, _MOVES[min(k, 2)], _STILL * resolution * 2**k)
+        return gauss_newton(_residual, pose, args, moves, still * resolution * 2**k)
+
+    def from_nearby(pose):
+        return at_level(0, thinned(sweep, _NEARBY_BEAMS), pose, _NEARBY_MOVES, _NEARBY_STILL)
 
     def from_afar(pose):
         for k in reversed(range(len(grid.levels))):
-            pose = at_level(k, sweep, pose)
+            pose = at_level(k, sweep, pose, _MOVES[min(k, 2)], _STILL)
         return pose
-
-    def from_nearby(pose):
-        return at_level(0, thinned(sweep, _NEARBY_BEAMS), pose)
 
     return jax.lax.cond(near, from_nearby, from_afar, start)
 

@@ -127,7 +127,7 @@ def predict(
     coast = _coast(dt)
 
     def carry(rows):
-        """F @ rows: a beacon's place moves by its velocity if it is carried, the robot's rows as its transition says."""
+        """F @ rows: a beacon's place moves by its velocity if it is carried, the robot's rows as its transition."""
         velocities = jnp.where(jnp.repeat(moving, 2)[:, None], rows[2 * k : 4 * k], 0.0)
         beacons = jnp.concatenate([rows[: 2 * k] + coast * velocities, velocities, rows[4 * k :]])
         return _put_robot(beacons, F_robot @ _take_robot(rows))

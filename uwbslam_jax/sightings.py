@@ -251,9 +251,9 @@ def judge(sightings: Sightings, known: Known, slot: int, velocity: np.ndarray) -
 
 
 def _is_noise(here: np.ndarray, at: np.ndarray, whitened: np.ndarray, sigma: np.ndarray, time: np.ndarray) -> bool:
-    """Whether rows scatter about a place (R, 2) as their noise lets them, and neither another place, nor a velocity, nor
-    a bias could explain them much better: what it can gain is that of the linear problem. So much cheaper than to fit
-    them all that it is asked first."""
+    """Whether rows scatter about a place (R, 2) as their noise lets them, and neither another place, nor a velocity,
+    nor a bias could explain them much better: what it can gain is that of the linear problem. So much cheaper than to
+    fit them all that it is asked first."""
     square = float(whitened @ whitened)
     if square > len(whitened) + _NOISE * np.sqrt(2.0 * len(whitened)):
         return False

@@ -32,8 +32,7 @@ _LOST_SCORE = 0.5
 _FINE_SCORE = 0.8
 _WIDE_HEADING = 0.15
 """A heading less certain than this [rad] is searched for unless the scan fits finely where it was expected."""
-_FEWEST_RETURNS = 20
-"""A scan of fewer returns is not worth a search."""
+_FEWEST_RETURNS = 20  # a scan of fewer is not worth a search
 _ALIGN_FLOOR = (0.1, 0.1, 0.05)
 """Alignment is LiDAR's business: the prior that holds it is never tighter than this [m, m, rad]."""
 _NEAR_REACH = 5.0
@@ -253,8 +252,8 @@ def _match(config, params, state, belief, sweep, surface, has_scan) -> tuple[Mat
     prior = Gaussian(C @ belief.mean, C @ belief.cov @ C.T + jnp.diag(jnp.array(_ALIGN_FLOOR) ** 2))
     start = prior.mean
     blind = matching.blind_direction(surface, sweep.valid)
-    expected = jnp.diagonal(prior.cov) - jnp.array(_ALIGN_FLOOR) ** 2
-    near = jnp.all(expected < jnp.array([config.resolution, config.resolution, config.resolution / _NEAR_REACH]) ** 2)
+    cell = config.resolution * jnp.array([1.0, 1.0, 1.0 / _NEAR_REACH])
+    near = jnp.all(jnp.diagonal(prior.cov) < jnp.array(_ALIGN_FLOOR) ** 2 + cell**2)
     pose = matching.align(state.grid, sweep, blind, start, prior, params.sigma_l, config.resolution, near)
     match = matching.assess(state.grid, sweep, surface, pose, config.resolution)
     unsure = (belief.cov[4 * config.nodes, 4 * config.nodes] > _WIDE_HEADING**2) | trust.restless(state.unrest)
@@ -293,11 +292,10 @@ def _draw(config, state, matched: _Matched, sweep, surface) -> tuple[State, Bool
         walls = matching.share_of_walls(surface, new, sweep.valid, pose[2])
         share = jnp.zeros((3, 3)).at[2, 2].set(novelty).at[:2, :2].set(walls)
         share = jnp.where(_map_errs(config, state), share, 0.0)
+        way = safe_norm(pose[:2] - state.drawn_pose[:2])
         return state._replace(
             belief=trust.anchor(state.belief, at, share),
-            map_spread=trust.learn_spread(
-                state.map_spread, state.belief, share, safe_norm(pose[:2] - state.drawn_pose[:2])
-            ),
+            map_spread=trust.learn_spread(state.map_spread, state.belief, share, way),
             grid=occupancy.integrate(state.grid, at, sweep, config.resolution, state.map_spread.way),
             drawn_pose=pose,
             scans_drawn=state.scans_drawn + 1,
