@@ -1,6 +1,6 @@
-"""Speed: `python -m benchmarks NAME` measures one thing, writes results/NAME.md and .json and prints the table.
+"""Speed: `python -m benchmarks NAME` measures one thing, prints and writes results/NAME.md and .json.
 
-With --gate the exit status is 1 where a figure misses its bar, or a ratio is worse than the committed baseline's by more
+With --gate the exit status is 1 where a figure misses its bar, or a ratio is worse than the committed baseline by more
 than its tolerance; --baseline puts this run's ratios into the baseline. How far off the answers are is
 `python -m benchmarks.scenarios` and `.recordings`.
 """

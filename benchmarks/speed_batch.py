@@ -36,8 +36,8 @@ def measure(*, quick: bool) -> Report:
     metrics += _parameter_sets(quick)
     about = (
         "`uwbslam run` as a user calls it, in a process of its own with a warm compilation cache, on the hall at 40 Hz "
-        "(1081 beams, five beacons, all pairs): from the shell to the last file. Reading: the recording decoded and made "
-        "into frames by itself. Parameter sets: the same twenty steps for other noise parameters by one vmap."
+        "(1081 beams, five beacons, all pairs): from the shell to the last file. Reading: the recording decoded and "
+        "made into frames by itself. Parameter sets: the same twenty steps for other noise of ranges, one vmap."
     )
     return Report("Whole recordings", about, metrics)
 

@@ -58,8 +58,8 @@ def measure(*, quick: bool) -> Report:
         ratio("warm / cold", warm[0] / cold),
     ]
     about = (
-        "Each a new process, timed from the shell. First published pose: of the hall at 40 Hz, when start-up has decided "
-        "the frame, some eight seconds into the recording; these are stepped too."
+        "Each a new process, timed from the shell. First published pose: of the hall at 40 Hz, when start-up has "
+        "decided the frame, some eight seconds into the recording; these are stepped too."
     )
     return Report("Start", about, metrics)
 

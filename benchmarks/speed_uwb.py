@@ -33,9 +33,9 @@ def measure(*, quick: bool) -> Report:
     track, z, guess = _simulate(epochs)
     metrics = _ours(track, z, guess)
     about = (
-        f"{epochs} epochs at 10 Hz, 15 ranges each (robot and five beacons, all pairs), sigma {_SIGMA} m, the same start "
-        f"{_GUESS_M} m off; position errors after one rigid motion over beacons and robot. The filter's time is that of a "
-        "compiled scan, an epoch; iSAM2's that of its update."
+        f"{epochs} epochs at 10 Hz, 15 ranges each (robot and five beacons, all pairs), sigma {_SIGMA} m, the same "
+        f"start {_GUESS_M} m off; position errors after one rigid motion over beacons and robot. The filter's time is "
+        "that of a compiled scan, an epoch; iSAM2's that of its update."
     )
     try:
         import gtsam

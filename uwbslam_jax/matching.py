@@ -32,9 +32,7 @@ _NORMAL_SPAN = (0.25, 1.0)
 """A normal needs neighbours this far apart [m]."""
 _BLIND = (0.006, 0.02)
 """Share of normals in the least seen direction below which a scan is blind in it, and above which it is not."""
-_SEARCH_HEADINGS = 120
-_SEARCH_BEAMS = 180
-_SEARCH_REFINED = 8
+_SEARCH_HEADINGS, _SEARCH_BEAMS, _SEARCH_REFINED = 120, 180, 8
 _UNLIKELY = 0.005
 """What a squared Mahalanobis distance of one costs a searched place, in mean Gamma: as if 100 beams were independent.
 Headings cost little: the search is for a robot that turned."""

@@ -39,8 +39,7 @@ _NEAR_REACH = 5.0
 """Walls so far away are hit by a beam within a cell where the heading is known that well [m]."""
 _DRAW_MOVED = (0.1, 0.05)
 """A scan is drawn when the robot has moved or turned this much since the last one [m, rad]."""
-_DRAW_FIRST = 10
-"""The first scans are all drawn: there is no map yet to be blurred."""
+_DRAW_FIRST = 10  # the first scans are all drawn: there is no map yet to be blurred
 _NEW_GROUND = 0.02
 """Share of new ground in a scan from which on it is drawn where the ranges say, not where the old map says."""
 _DRAW_PULL = (0.003, 0.0003)
