@@ -13,7 +13,7 @@ DRIVERS = Path(__file__).parents[1] / "drivers" / "uwbslam_drivers"
 # Numbers between whole ones are parts of the floor below them that stand on each other.
 FLOORS: dict[float, str] = {
     0: "__init__",
-    1: "geometry measurements config ekf result layout mcap_records paths rays sparse_rows",
+    1: "geometry measurements config ekf result layout mcap_records packing paths rays sparse_rows",
     2: "motion ranging grid metrics settings_file frames ros_types worlds multilateration",
     2.05: "keyframes",
     2.1: "sightings placement relative schemas result_log conditions",
@@ -23,7 +23,7 @@ FLOORS: dict[float, str] = {
     4: "matching",
     4.1: "paper trust",
     5: "slam",
-    5.1: "beacon_state registration redraw range_means",
+    5.1: "beacon_state heard registration redraw range_means",
     5.2: "graph",
     5.25: "steps",
     5.3: "smoothing",

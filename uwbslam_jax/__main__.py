@@ -72,13 +72,16 @@ def _fail(text: str) -> int:
 def prepare() -> None:
     """Settings of the process that the libraries read once, before they are imported.
 
-    Compiled programs are kept in the user's cache folder: the second run starts in seconds. LAPACK works alone: its
-    threads spin over matrices of 40 rows and make a step many times slower than one thread does.
+    Compiled programs are kept in the user's cache folder: the second run starts in seconds. LAPACK and XLA work alone:
+    LAPACK's threads spin over matrices of 40 rows and make a step many times slower than one thread does.
     """
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "uwbslam_jax" / "jax"
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # the same holds for XLA's kernels of a step, each of which takes microseconds
+    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
+    os.environ.setdefault("NPROC", "1")  # size of XLA's own thread pool
 
 
 def usage() -> str:

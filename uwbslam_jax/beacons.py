@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import jax
 import numpy as np
 
 from uwbslam_jax import beacon_state, layout, ranging
 from uwbslam_jax.config import Params, Settings
-from uwbslam_jax.measurements import Ranges, StampedFrame
+from uwbslam_jax.heard import Heard, heard
+from uwbslam_jax.measurements import StampedFrame
 from uwbslam_jax.multilateration import locate
 from uwbslam_jax.sightings import (
     DISTANCE,
@@ -57,6 +59,7 @@ _NEWEST = 4
 """So many of a beacon's newest ranges place a robot that was carried."""
 
 Event = tuple[int, str]
+_loudness = jax.jit(ranging.loudness)
 
 
 @dataclass
@@ -71,6 +74,19 @@ class _Life:
     sightings: Sightings = field(default_factory=Sightings)
 
 
+class _Copied:
+    """What is asked of a state for every slot, on the host: copied once and not for each."""
+
+    def __init__(self, state: State, sigma_n: float):
+        k = state.active.shape[0]
+        self.of = state
+        self.places = np.asarray(state.belief.mean, float)[: 2 * k].reshape(k, 2)
+        self.variance = np.max(np.diag(np.asarray(state.belief.cov, float))[: 2 * k].reshape(k, 2), axis=1)
+        self.variance[0] = 0.0  # the robot's track is taken as a whole, see beacon_state.place
+        self.rests = np.asarray(state.active) & ~np.asarray(state.moving)
+        self.noise = sigma_n * np.asarray(_loudness(state.scatter.log), float)
+
+
 class BeaconKeeper:
     """Life of all beacons; see the module's first lines."""
 
@@ -79,6 +95,7 @@ class BeaconKeeper:
         self._sigma_n = settings.uwb.sigma_n
         self._lives: dict[int, _Life] = {}
         self._start: int | None = None
+        self._copied: _Copied | None = None
         self._contradicted: float | None = None  # since when another place explains the robot's ranges [s]
 
     def status(self, slot: int) -> str:
@@ -101,7 +118,8 @@ class BeaconKeeper:
         self, state: State, params: Params, pending: list[tuple[StampedFrame, Estimate]]
     ) -> tuple[State, list[Event]]:
         """The state after what a few frames told about the beacons, and what happened to which slot."""
-        self._listen(pending, params)
+        self._seconds(pending[0][0].stamp)  # time counts from the first frame
+        self._listen(heard(pending, params))
         span = self._seconds(pending[-1][0].stamp) - self._seconds(pending[0][0].stamp)
         now = self._seconds(pending[-1][0].stamp)
         share, found = self._find_carried_robot(state, self._known(state, now, 0))
@@ -124,37 +142,27 @@ class BeaconKeeper:
         return state, events
 
     def _known(self, state: State, now: float, slot: int) -> Known:
-        k = state.active.shape[0]
-        mean, P = np.asarray(state.belief.mean, float), np.asarray(state.belief.cov, float)
-        variance = np.max(np.diag(P)[: 2 * k].reshape(k, 2), axis=1)
-        variance[0] = 0.0  # the robot's track is taken as a whole, see beacon_state.place
-        trusted = np.asarray(state.active) & ~np.asarray(state.moving)
+        if self._copied is None or self._copied.of is not state:
+            self._copied = _Copied(state, self._sigma_n)
+        trusted = self._copied.rests.copy()
         trusted[[slot for slot, life in self._lives.items() if life.doubted is not None]] = False
-        noise = self._sigma_n * np.asarray(ranging.loudness(state.scatter.log[slot]), float)
-        return Known(mean[: 2 * k].reshape(k, 2), variance, trusted, self._sigma_n, noise, now)
+        noise = self._copied.noise[slot]
+        return Known(self._copied.places, self._copied.variance, trusted, self._sigma_n, noise, now)
 
-    def _listen(self, pending: list[tuple[StampedFrame, Estimate]], params: Params) -> None:
+    def _listen(self, ranges: Heard) -> None:
         """Remember each usable range to a node of known place."""
-        heard: dict[int, list[np.ndarray]] = {}
-        for frame, estimate in pending:
-            r, now = frame.frame.ranges, self._seconds(frame.stamp)
-            k = np.flatnonzero(np.asarray(r.valid) & ~(np.asarray(r.power_gap) > self._nlos_gap_db))
-            i, j = np.asarray(r.i)[k], np.asarray(r.j)[k]
-            age = np.asarray(r.age, float)[k]
-            known = np.asarray(estimate.active) & ~np.asarray(estimate.moving)
-            antenna = antenna_at(estimate, age, params)
-            columns = [now + age, i, *antenna.T, _flat(r, k, params), np.asarray(estimate.normalised, float)[k]]
-            for node, other in ((i, j), (j, i)):
-                columns[OTHER] = other
-                rows = np.stack(columns, axis=1)[known[other]]
-                for slot in np.unique(node):
-                    if slot > 0:
-                        self._life(int(slot)).heard = now
-                        heard.setdefault(int(slot), []).append(rows[node[known[other]] == slot])
-        for slot, parts in heard.items():
-            rows = np.concatenate(parts)
-            if len(rows):
-                self._life(slot).sightings.add(rows)
+        kept = ~(ranges.power_gap > self._nlos_gap_db)
+        ranges = ranges._replace(**{name: column[kept] for name, column in ranges._asdict().items()})
+        time = (ranges.stamp - (self._start or 0)) / 1e9
+        columns = [time + ranges.age, ranges.i, *ranges.antenna.T, ranges.flat, ranges.normalised]
+        for node, other, usable in ((ranges.i, ranges.j, ranges.rests_j), (ranges.j, ranges.i, ranges.rests_i)):
+            columns[OTHER] = other
+            rows = np.stack(columns, axis=1)
+            for slot in map(int, np.unique(node[node > 0])):
+                life, mine = self._life(slot), node == slot
+                life.heard = max(life.heard, float(time[mine][-1]))
+                if (mine & usable).any():
+                    life.sightings.add(rows[mine & usable])
 
     def _try_to_place(self, state: State, known: Known, slot: int, life: _Life, events: list[Event]) -> State:
         resting = resting_place(life.sightings, known)
@@ -271,21 +279,3 @@ class BeaconKeeper:
             return share, None
         left = np.abs(np.linalg.norm(anchors - found[0], axis=1) - distance)
         return share, found[0] if np.mean(left < _MISFIT * self._sigma_n) > _FOUND_SHARE else None
-
-
-def antenna_at(estimate: Estimate, age: np.ndarray, params: Params) -> np.ndarray:
-    """(R, 2) where the robot's antenna was at each exchange [m]."""
-    pose = np.asarray(estimate.pose, float)
-    heading = pose[2] + float(estimate.yaw_rate) * age
-    x, y = np.asarray(params.antenna, float)
-    c, s = np.cos(heading), np.sin(heading)
-    lever = np.stack([c * x - s * y, s * x + c * y], axis=1)
-    return pose[:2] + age[:, None] * np.asarray(estimate.velocity, float) + lever
-
-
-def _flat(r: Ranges, k: np.ndarray, params: Params) -> np.ndarray:
-    """(R,) distances in the plane of the ranges k of a frame, biases and heights taken off [m]."""
-    i, j = np.asarray(r.i)[k], np.asarray(r.j)[k]
-    height, bias = np.asarray(params.height, float), np.asarray(params.bias, float)
-    slant = (np.asarray(r.range, float)[k] - bias[i] - bias[j]) / (1.0 + float(params.bias_scale))
-    return np.sqrt(np.maximum(slant**2 - (height[i] - height[j]) ** 2, 0.01))

@@ -51,7 +51,7 @@ def to_result(session: Session, facts: Facts) -> Result:
     A run whose frame was never decided has its poses and map in the frame that the robot started in.
     """
     history = session.history
-    scans = any(history.has_scan)
+    scans = bool(history.has_scan.values.any())
     at = np.flatnonzero(history.has_scan) if scans or not facts.odometry_used else np.arange(len(history.stamps))
     told = [] if scans else [_NO_SCAN if facts.odometry_used else _NO_TRACK]
     told += [] if facts.relative is None else [_RELATIVE]

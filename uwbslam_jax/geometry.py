@@ -39,7 +39,10 @@ def between(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
 
 def transform_points(pose: Float[Array, "3"], points: Float[Array, "n 2"]) -> Float[Array, "n 2"]:
     """Points given in the frame of a pose, in the frame that the pose is given in [m]."""
-    return points @ rotation(pose[2]).T + pose[None, :2]
+    # written out: on a CPU the product by a 2 x 2 matrix is 20 times slower, for its transposes
+    c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
+    x, y = points[:, 0], points[:, 1]
+    return jnp.stack([pose[0] + (c * x - s * y), pose[1] + (s * x + c * y)], axis=-1)
 
 
 def safe_norm(vectors: Float[Array, "*n 2"]) -> Float[Array, "*n"]:

@@ -5,6 +5,7 @@ Collected while the steps run, solved by `smoothing`. Host arrays; grows with th
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -239,10 +240,12 @@ def map_pose(estimate: Estimate) -> np.ndarray:
 def sight(estimate: Estimate) -> float:
     """What a match told of the position: NaN for all of it, inf for nothing, else the direction that it cannot see, in
     the map's frame [rad]."""
-    values, vectors = np.linalg.eigh(np.asarray(estimate.information, float)[:2, :2])
-    if values[0] > _SEEN_M**-2:
-        return float("nan")
-    return float(np.arctan2(vectors[1, 0], vectors[0, 0])) if values[1] > _SEEN_M**-2 else float("inf")
+    (xx, xy), (_, yy) = estimate.information[:2, :2].tolist()
+    mean, spread = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)  # the eigenvalues are mean -+ spread
+    if mean - spread > _SEEN_M**-2:
+        return math.nan
+    along = 0.5 * math.atan2(2 * xy, xx - yy)  # where most is seen
+    return along + 0.5 * math.pi if mean + spread > _SEEN_M**-2 else math.inf
 
 
 def relative(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -165,6 +165,12 @@ def _integrate_level(level, origin, size, ends, sensor, yaw, sweep):
     bearing, distance = _polar_tables(half, size)
     middle = jnp.round((sensor - origin) / size).astype(jnp.int32)
     start = jnp.clip(middle - half, 0, cells - 2 * half)
+    cell = jnp.floor((ends - origin[None]) / size).astype(jnp.int32)
+    inside = sweep.valid & jnp.all((cell >= 0) & (cell < cells), axis=-1)
+    clipped = jnp.clip(cell, 0, cells - 1)
+    struck = jnp.clip(level[clipped[:, 1], clipped[:, 0]] + HIT, *CLAMP)
+    # what is read of the level is read before any of it is written: so it is written where it is, without a copy
+    struck, level = lax.optimization_barrier((struck, level))
     block = lax.dynamic_slice(level, (start[1], start[0]), (2 * half, 2 * half))
     # near the window's edge the block cannot be centred; its tables are shifted by as many cells
     shift = start - (middle - half)
@@ -172,16 +178,11 @@ def _integrate_level(level, origin, size, ends, sensor, yaw, sweep):
     distance = _shifted(distance, shift)
     # a sensor outside the window is beyond the shifted tables: it frees nothing
     free = _passed(bearing, distance, yaw, size, sweep) & jnp.all((middle >= 0) & (middle <= cells))
-    block = jnp.where(free, block + FREE, block)
+    block = jnp.where(free, jnp.maximum(block + FREE, CLAMP[0]), block)
     freed = lax.dynamic_update_slice(level, block, (start[1], start[0]))
-    cell = jnp.floor((ends - origin[None]) / size).astype(jnp.int32)
-    inside = sweep.valid & jnp.all((cell >= 0) & (cell < cells), axis=-1)
     row, col = jnp.where(inside, cell[:, 1], cells), jnp.where(inside, cell[:, 0], cells)
-    clipped = jnp.clip(cell, 0, cells - 1)
-    struck = level[clipped[:, 1], clipped[:, 0]] + HIT
     # many beams in one cell write the same value: once hit is once hit
-    drawn = freed.at[row, col].set(struck, mode="drop")
-    return jnp.clip(drawn, *CLAMP)
+    return freed.at[row, col].set(struck, mode="drop")
 
 
 def _shifted(table: np.ndarray, shift: Int[Array, "2"]) -> Float[Array, "h h"]:

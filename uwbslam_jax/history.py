@@ -1,6 +1,6 @@
 """What a run reported, kept on the host for the files that are written when it ends.
 
-A few numbers a frame, so that memory grows by about 300 bytes a frame; residuals are thinned.
+A few numbers a frame in arrays, so that memory grows by about 120 bytes a frame; residuals are thinned.
 """
 
 from __future__ import annotations
@@ -16,6 +16,50 @@ _RESIDUALS_EVERY_S = 0.5
 _TRACK_EVERY_S = 1.0
 
 
+class Column:
+    """Rows of one shape, appended one at a time, in one array that is doubled when it is full."""
+
+    def __init__(self, shape: tuple[int, ...] = (), dtype: type = np.float32):
+        self._rows = np.zeros((64, *shape), dtype)
+        self._count = 0
+
+    def append(self, row) -> None:
+        """One more row at the end."""
+        if self._count == len(self._rows):
+            self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
+        self._rows[self._count] = row
+        self._count += 1
+
+    @property
+    def values(self) -> np.ndarray:
+        """All rows so far, a view."""
+        return self._rows[: self._count]
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, index):
+        return self.values[index]
+
+    def __array__(self, dtype=None, copy=None) -> np.ndarray:
+        return np.array(self.values, dtype)
+
+
+_DIAGNOSTICS = (
+    "match_score",
+    "known_share",
+    "poor_match",
+    "searched",
+    "drawn",
+    "hypotheses",
+    "beacons",
+    "ranges",
+    "ranges_used",
+    "ranges_nlos",
+    "ranges_doubted",
+)
+
+
 class History:
     """Poses, covariances and diagnostics of every frame since the first scan, beacons once a second, events.
 
@@ -25,50 +69,58 @@ class History:
       diagnostics: one entry a frame by name.
       residuals: (t, slot, slot, measured minus predicted); tracks: (t, slot, x, y, sigma).
       events: (stamp, text).
-      beacons: slot -> position (2,) [m] and covariance (2, 2) [m^2] when it was last in the state.
+      left: beacons as they were when one of them last left the state, see `beacons`.
       last_scan: number, frame and estimate of the last frame that had a scan.
     """
 
     def __init__(self) -> None:
-        self.stamps: list[int] = []
-        self.poses: list[np.ndarray] = []
-        self.map_poses: list[np.ndarray] = []
-        self.sight: list[float] = []
-        self.covs: list[np.ndarray] = []
-        self.has_scan: list[bool] = []
-        self.diagnostics: dict[str, list[float]] = {}
+        self.stamps = Column(dtype=np.int64)
+        self.poses = Column((3,), np.float64)
+        self.map_poses = Column((3,), np.float64)
+        self.sight = Column()
+        self.covs = Column((3, 3))
+        self.has_scan = Column(dtype=np.bool_)
+        self._diagnostics = Column((len(_DIAGNOSTICS),))
         self.residuals: list[tuple[int, int, int, float]] = []
         self.tracks: list[tuple[int, int, float, float, float]] = []
         self.events: list[tuple[int, str]] = []
-        self.beacons: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         self.last_scan: tuple[int, StampedFrame, Estimate] | None = None
         self._residuals_at = self._tracks_at = 0
+        self.left: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self._seen: Estimate | None = None
+
+    @property
+    def beacons(self) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+        """Slot -> position (2,) [m] and covariance (2, 2) [m^2] when it was last in the state."""
+        self._keep_beacons()
+        return self.left
+
+    def _keep_beacons(self) -> None:
+        if self._seen is not None:
+            for slot in np.flatnonzero(self._seen.active[1:]) + 1:
+                self.left[int(slot)] = np.array(self._seen.beacons[slot]), np.array(self._seen.beacon_covs[slot])
+
+    @property
+    def diagnostics(self) -> dict[str, np.ndarray]:
+        """Name -> one value a frame."""
+        return dict(zip(_DIAGNOSTICS, self._diagnostics.values.T, strict=True)) if len(self._diagnostics) else {}
 
     def add(self, frame: StampedFrame, estimate: Estimate, hypotheses: int) -> None:
         """Take in one step."""
         self.stamps.append(frame.stamp)
-        self.poses.append(np.asarray(estimate.pose, float))
+        self.poses.append(estimate.pose)
         self.map_poses.append(map_pose(estimate))
         self.sight.append(sight(estimate))
-        self.covs.append(np.asarray(estimate.pose_cov))
-        self.has_scan.append(bool(frame.frame.has_scan))
-        r = frame.frame.ranges
+        self.covs.append(estimate.pose_cov)
+        self.has_scan.append(frame.frame.has_scan)
+        r, active = frame.frame.ranges, estimate.active
         used = estimate.weight > 0
-        values = {
-            "match_score": float(estimate.score),
-            "known_share": float(estimate.known),
-            "poor_match": float(estimate.poor),
-            "searched": float(estimate.searched),
-            "drawn": float(estimate.drawn),
-            "hypotheses": float(hypotheses),
-            "beacons": float(np.sum(estimate.active) - 1),
-            "ranges": float(np.sum(r.valid)),
-            "ranges_used": float(np.sum(estimate.weight > 0.25)),
-            "ranges_nlos": float(np.sum(r.valid & ~used & estimate.active[r.i] & estimate.active[r.j])),
-            "ranges_doubted": float(np.sum(used & (estimate.weight <= 0.25))),
-        }
-        for name, value in values.items():
-            self.diagnostics.setdefault(name, []).append(value)
+        believed = np.count_nonzero(estimate.weight > 0.25)
+        unused = np.flatnonzero(r.valid & ~used)
+        nlos = np.count_nonzero(active[r.i[unused]] & active[r.j[unused]])
+        told = (estimate.score, estimate.known, estimate.poor, estimate.searched, estimate.drawn, hypotheses)
+        counts = (np.count_nonzero(r.valid), believed, nlos, np.count_nonzero(used) - believed)
+        self._diagnostics.append((*told, np.count_nonzero(active) - 1, *counts))
         if frame.stamp - self._residuals_at > _RESIDUALS_EVERY_S * 1e9:
             self._residuals_at = frame.stamp
             for k in np.flatnonzero(used):
@@ -79,8 +131,9 @@ class History:
                 x, y = estimate.beacons[slot]
                 sigma = float(np.sqrt(max(np.linalg.eigvalsh(estimate.beacon_covs[slot])[-1], 0.0)))
                 self.tracks.append((frame.stamp, int(slot), float(x), float(y), sigma))
-        for slot in np.flatnonzero(estimate.active[1:]) + 1:
-            self.beacons[int(slot)] = (np.asarray(estimate.beacons[slot]), np.asarray(estimate.beacon_covs[slot]))
+        if self._seen is None or (active != self._seen.active).any():
+            self._keep_beacons()
+        self._seen = estimate
         if frame.frame.has_scan:
             self.last_scan = (len(self.stamps) - 1, frame, estimate)
 
@@ -91,16 +144,14 @@ class History:
     def carry_along(self, anchors: np.ndarray, before: np.ndarray, after: np.ndarray) -> None:
         """The map was corrected: its keyframes, at anchors (N,) [ns], moved from before (N, 3) to after. What was
         published stays."""
-        self.map_poses = list(carried_along(np.array(self.stamps), np.array(self.map_poses), anchors, before, after))
+        moved = carried_along(self.stamps.values, self.map_poses.values, anchors, before, after)
+        self.map_poses.values[:] = moved
 
     def republish(self, adopted: Adopted) -> None:
         """The frame was decided: what was reported in the start frame is put into the published one."""
-        stamps = np.array(self.stamps)
-        poses = adopted.republish(stamps, np.array(self.poses))
-        self.map_poses = list(adopted.republish(stamps, np.array(self.map_poses)))
-        turn = adopted.turn
-        c, s = np.cos(turn), np.sin(turn)
+        self.poses.values[:] = adopted.republish(self.stamps.values, self.poses.values)
+        self.map_poses.values[:] = adopted.republish(self.stamps.values, self.map_poses.values)
+        self.sight.values[:] += adopted.turn
+        c, s = np.cos(adopted.turn), np.sin(adopted.turn)
         R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-        self.poses = list(poses)
-        self.sight = [angle + turn for angle in self.sight]
-        self.covs = [R @ P @ R.T for P in self.covs]
+        self.covs.values[:] = R @ self.covs.values @ R.T

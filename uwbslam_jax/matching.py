@@ -8,24 +8,31 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import optimistix as optx
+from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
 from uwbslam_jax import grid as occupancy
 from uwbslam_jax.ekf import Gaussian, symmetric_root
-from uwbslam_jax.geometry import rotation, safe_norm, transform_points, wrap_angle
+from uwbslam_jax.geometry import rotation, transform_points, wrap_angle
 from uwbslam_jax.grid import Grid, Sweep
 from uwbslam_jax.objective import lidar_gram, lidar_residual, prior_residual
 
 _MOVES = (6, 5, 5)
-"""Gauss-Newton moves at the finest, middle and every coarser level."""
+"""Gauss-Newton moves at the finest, middle and every coarser level, at most."""
+_STILL = 0.005
+"""A level is done when a move is shorter than this many of its cells [cells of m or rad]."""
+_NEARBY_BEAMS = 540
+"""A scan that is nearly in place needs no more beams than this: neighbours hit the same cell."""
+_NEARBY_MOVES, _NEARBY_STILL = 3, 0.02
+"""Nor more moves, and what its last is shorter than [cells of m or rad]."""
+_CHECKED_BEAMS = 360
+"""And more than this do not tell how well it fits where it was expected."""
 _NEIGHBOURS = (1, 2, 4, 8, 16)
 _NORMAL_SPAN = (0.25, 1.0)
 """A normal needs neighbours this far apart [m]."""
 _BLIND = (0.006, 0.02)
 """Share of normals in the least seen direction below which a scan is blind in it, and above which it is not."""
-_SEARCH_HEADINGS = 120
-_SEARCH_BEAMS = 180
-_SEARCH_REFINED = 8
+_SEARCH_HEADINGS, _SEARCH_BEAMS, _SEARCH_REFINED = 120, 180, 8
 _UNLIKELY = 0.005
 """What a squared Mahalanobis distance of one costs a searched place, in mean Gamma: as if 100 beams were independent.
 Headings cost little: the search is for a robot that turned."""
@@ -67,11 +74,11 @@ class Surface(NamedTuple):
     """Where the beams of a scan meet surfaces whose direction can be told.
 
     Attributes:
-      tangent: (B, 2) unit vector along the surface in the robot's frame, 0 where there is none.
+      tangent: (2, B) unit vectors along the surface in the robot's frame, 0 where there is none.
       found: (B,) whether there is one.
     """
 
-    tangent: Float[Array, "B 2"]
+    tangent: Float[Array, "2 B"]
     found: Bool[Array, "B"]
 
 
@@ -80,19 +87,26 @@ def surface(sweep: Sweep) -> Surface:
     where the three are not on one line there is no surface."""
     # what is seen is a decision, held when the step is differentiated
     points, valid = jax.lax.stop_gradient(sweep.points), sweep.valid
-    tangent = jnp.zeros_like(points)
-    found = jnp.zeros_like(valid)
+    beams, most = valid.shape[0], _NEIGHBOURS[-1]
+    x, y = points[:, 0], points[:, 1]
+    wide_x, wide_y, wide_valid = (jnp.pad(a, most) for a in (x, y, valid))
+
+    def shifted(a, k):
+        return a[most + k : most + k + beams]
+
+    tx, ty, found = jnp.zeros_like(x), jnp.zeros_like(y), jnp.zeros_like(valid)
     for k in _NEIGHBOURS:
-        before, after = jnp.roll(points, k, axis=0), jnp.roll(points, -k, axis=0)
-        t = after - before
-        span = safe_norm(t)
-        index = jnp.arange(points.shape[0])
-        ok = valid & jnp.roll(valid, k) & jnp.roll(valid, -k) & (index >= k) & (index < points.shape[0] - k)
-        bend = safe_norm(after + before - 2 * points)
-        ok = ok & (span > _NORMAL_SPAN[0]) & (span < _NORMAL_SPAN[1]) & (bend < 0.05 + 0.1 * span) & ~found
-        tangent = jnp.where(ok[:, None], t / jnp.maximum(span, 1e-6)[:, None], tangent)
+        before_x, after_x = shifted(wide_x, -k), shifted(wide_x, k)
+        before_y, after_y = shifted(wide_y, -k), shifted(wide_y, k)
+        dx, dy = after_x - before_x, after_y - before_y
+        span = jnp.sqrt(dx**2 + dy**2)
+        bend = jnp.sqrt((after_x + before_x - 2 * x) ** 2 + (after_y + before_y - 2 * y) ** 2)
+        ok = valid & shifted(wide_valid, -k) & shifted(wide_valid, k) & ~found
+        ok = ok & (span > _NORMAL_SPAN[0]) & (span < _NORMAL_SPAN[1]) & (bend < 0.05 + 0.1 * span)
+        scale = 1.0 / jnp.maximum(span, 1e-6)
+        tx, ty = jnp.where(ok, dx * scale, tx), jnp.where(ok, dy * scale, ty)
         found = found | ok
-    return Surface(tangent, found)
+    return Surface(jnp.stack([tx, ty]), found)
 
 
 def blind_direction(surface: Surface, counted: Bool[Array, "B"]) -> Blind:
@@ -105,11 +119,15 @@ def blind_direction(surface: Surface, counted: Bool[Array, "B"]) -> Blind:
       counted: beams that take part.
     """
     counted = counted & surface.found
-    tangent = jnp.where(counted[:, None], surface.tangent, 0.0)
-    T = tangent.T @ tangent  # of tangents: its largest eigenvector is where the walls run
-    share, directions = jnp.linalg.eigh(T / jnp.maximum(jnp.sum(counted), 1))
-    weight = jnp.clip((_BLIND[1] - share[0]) / (_BLIND[1] - _BLIND[0]), 0.0, 1.0)
-    return Blind(directions[:, 1], jnp.where(jnp.sum(counted) > 20, weight, 0.0))
+    tangent, count = jnp.where(counted, surface.tangent, 0.0), jnp.sum(counted)
+    # of tangents: the larger eigenvector of [[a, b], [b, c]] is where the walls run
+    T = tangent @ tangent.T / jnp.maximum(count, 1)
+    a, b, c = T[0, 0], T[0, 1], T[1, 1]
+    angle = 0.5 * jnp.arctan2(2 * b, a - c)
+    direction = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+    least = jnp.maximum(0.5 * (a + c - jnp.sqrt((a - c) ** 2 + 4 * b**2)), 0.0)
+    weight = jnp.clip((_BLIND[1] - least) / (_BLIND[1] - _BLIND[0]), 0.0, 1.0)
+    return Blind(direction, jnp.where(count > 20, weight, 0.0))
 
 
 def seen(blind: Blind, heading: Float[Array, ""]) -> Float[Array, "2 2"]:
@@ -129,8 +147,9 @@ def share_of_walls(
     """
 
     def gram(beams):
-        normal = jnp.where((beams & surface.found)[:, None], surface.tangent, 0.0)[:, ::-1] * jnp.array([[1.0, -1.0]])
-        return normal.T @ normal
+        t = jnp.where(beams & surface.found, surface.tangent, 0.0)
+        normal = jnp.stack([t[1], -t[0]])
+        return normal @ normal.T
 
     R = rotation(heading)
     few = _BLIND[0] * jnp.maximum(jnp.sum(counted), 1)
@@ -158,13 +177,36 @@ def _residual(pose: Float[Array, "3"], a: _LidarAndPrior) -> Float[Array, "7"]:
     return jnp.concatenate([lidar, prior_residual(pose, a.mean, a.root)])
 
 
-def gauss_newton(residual, start, args, moves: int):
-    """Least squares by `moves` Gauss-Newton moves of optimistix; never raises, returns the last iterate."""
-    solver = optx.GaussNewton(rtol=1e-3, atol=1e-4, linear_solver=lx.Normal(lx.Cholesky()))
+class _GaussNewton(optx.GaussNewton):
+    """Gauss-Newton that stops by the length of a move alone, and takes that move.
+
+    Optimistix also waits until no entry of the residual changes any more, which those of a Gram matrix's root never do:
+    where the pose is right they pass through zero. And it evaluates once more after the last move.
+    """
+
+    def terminate(self, fn, y, args, options, state, tags):
+        move = state.descent_state.newton
+        return (state.num_steps > 0) & (jnp.max(jnp.abs(move)) < self.atol), state.result
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        return jnp.where(jnp.all(jnp.isfinite(state.y_eval)), state.y_eval, y), aux, {}
+
+
+def gauss_newton(residual, start, args, moves: int, still: float = 0.0):
+    """Least squares by `moves` Gauss-Newton moves of optimistix at most; never raises, returns the last iterate. A move
+    of which every coordinate is shorter than `still` is the last."""
+    solver = _GaussNewton(rtol=0.0, atol=still, linear_solver=lx.Normal(lx.Cholesky()))
     solution = optx.least_squares(
-        residual, solver, start, args=args, max_steps=moves + 1, throw=False, adjoint=optx.RecursiveCheckpointAdjoint()
+        residual, solver, start, args=args, max_steps=moves, throw=False, adjoint=optx.RecursiveCheckpointAdjoint()
     )
     return solution.value
+
+
+def thinned(sweep: Sweep, most: int = _CHECKED_BEAMS) -> Sweep:
+    """Every so manieth beam, about as many as asked for."""
+    n = max(1, sweep.valid.shape[0] // most)
+    few = sweep._replace(points=sweep.points[::n], valid=sweep.valid[::n], reach=sweep.reach[::n])
+    return few._replace(bearing_step=n * sweep.bearing_step)
 
 
 def align(
@@ -175,17 +217,34 @@ def align(
     prior: Gaussian,
     sigma_l: Float[Array, ""],
     resolution: float,
+    near: bool | Bool[Array, ""] = False,
 ) -> Float[Array, "3"]:
-    """Pose that minimises 1/2 sum (1 - Gamma)^2 / sigma_l^2 + the prior's quadratic, coarse to fine (DESIGN 1.4)."""
-    root = jnp.linalg.inv(symmetric_root(prior.cov))
+    """Pose that minimises 1/2 sum (1 - Gamma)^2 / sigma_l^2 + the prior's quadratic, coarse to fine (DESIGN 1.4).
+
+    Args:
+      near: the start is within a cell of the answer: the coarser levels would only lead away from it and back, and
+        fewer beams will do.
+    """
+    root = solve_triangular(symmetric_root(prior.cov), jnp.eye(3, dtype=start.dtype), lower=True)
     projector = seen(blind, start[2])
-    pose = start
-    for k in reversed(range(len(grid.levels))):
+
+    def at_level(k: int, beams: Sweep, pose, moves: int, still: float):
         size = jnp.asarray(resolution * 2**k, pose.dtype)
-        scan = (grid.levels[k], grid.origin, size, sweep.points, sweep.valid)
-        args = _LidarAndPrior(*scan, prior.mean, root, sigma_l, projector)
-        pose = gauss_newton(_residual, pose, args, _MOVES[min(k, 2)])
-    return pose
+        # fewer beams weigh as much as all of them
+        weight = jnp.sqrt(jnp.asarray(beams.valid.shape[0] / sweep.valid.shape[0], pose.dtype))
+        scan = (grid.levels[k], grid.origin, size, beams.points, beams.valid)
+        args = _LidarAndPrior(*scan, prior.mean, root, sigma_l * weight, projector)
+        return gauss_newton(_residual, pose, args, moves, still * resolution * 2**k)
+
+    def from_nearby(pose):
+        return at_level(0, thinned(sweep, _NEARBY_BEAMS), pose, _NEARBY_MOVES, _NEARBY_STILL)
+
+    def from_afar(pose):
+        for k in reversed(range(len(grid.levels))):
+            pose = at_level(k, sweep, pose, _MOVES[min(k, 2)], _STILL)
+        return pose
+
+    return jax.lax.cond(near, from_nearby, from_afar, start)
 
 
 def assess(grid: Grid, sweep: Sweep, surface: Surface, pose: Float[Array, "3"], resolution: float) -> Match:

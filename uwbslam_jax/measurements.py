@@ -163,3 +163,16 @@ class StampedFrame:
     stamp: int
     frame: Frame
     slots: dict[int, int] = field(default_factory=dict)  # node id -> slot, as known at this frame
+
+
+def empty_frame(beams: int, ranges: int) -> Frame:
+    """A frame without any measurement, of a size."""
+    zero, no = np.float32(0.0), np.bool_(False)
+    none, slots = np.zeros(ranges, np.float32), np.zeros(ranges, np.int32)
+    return Frame(
+        dt=zero,
+        has_scan=no,
+        scan=Scan(np.zeros(beams, np.float32), np.zeros(beams, bool), zero, np.float32(1e-3), zero),
+        ranges=Ranges(slots, slots + 1, none, none, none + np.float32(NAN), np.zeros(ranges, bool)),
+        odometry=Odometry(np.zeros(3, np.float32), no),
+    )

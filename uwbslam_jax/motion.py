@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from uwbslam_jax import ekf, layout
 from uwbslam_jax.config import Params
 from uwbslam_jax.geometry import perpendicular, rotation, safe_norm
-from uwbslam_jax.layout import Nodes
 from uwbslam_jax.measurements import Odometry
 
 _COAST_S = 1.5
@@ -29,32 +29,45 @@ def transition(
     that moves, none of one at rest. The map error is a rigid motion of the map, so it turns with the lever arm that
     the robot drives."""
     s = layout.unpack(vector)
-    coast = _COAST_S * (1.0 - jnp.exp(-dt / _COAST_S))
-    safe_dt = jnp.maximum(dt, 1e-3)
-    turn = s.yaw_rate * coast
-    coasted = rotation(turn / 2) @ s.velocities[0] * coast
-    driven = rotation(s.heading) @ odometry.increment[:2]
+    coast = _coast(dt)
+    velocities = jnp.where(moving[:, None], s.velocities, 0.0)
+    beacons = s._replace(positions=s.positions + coast * velocities, velocities=velocities)
+    return _put_robot(layout.pack(beacons), _robot_transition(_take_robot(vector), dt, odometry))
+
+
+def _coast(dt):
+    return _COAST_S * (1.0 - jnp.exp(-dt / _COAST_S))
+
+
+def _take_robot(rows: Float[Array, "n *m"]) -> Float[Array, "9 *m"]:
+    """The robot's own rows: place, velocity, heading, yaw rate and map error. How they move depends on no beacon."""
+    k = layout.node_count(rows.shape[0])
+    return jnp.concatenate([rows[:2], rows[2 * k : 2 * k + 2], rows[4 * k :]])
+
+
+def _put_robot(rows: Float[Array, "n *m"], robot: Float[Array, "9 *m"]) -> Float[Array, "n *m"]:
+    k = layout.node_count(rows.shape[0])
+    return jnp.concatenate([robot[:2], rows[2 : 2 * k], robot[2:4], rows[2 * k + 2 : 4 * k], robot[4:]])
+
+
+def _robot_transition(robot: Float[Array, "9"], dt: Float[Array, ""], odometry: Odometry) -> Float[Array, "9"]:
+    place, speed, heading, rate, error = robot[:2], robot[2:4], robot[4], robot[5], robot[6:]
+    coast, safe_dt = _coast(dt), jnp.maximum(dt, 1e-3)
+    turn = rate * coast
+    coasted = rotation(turn / 2) @ speed * coast
+    driven = rotation(heading) @ odometry.increment[:2]
     step = jnp.where(odometry.valid, driven, coasted)
     slower = jnp.exp(-dt / (4 * _COAST_S))
     gain = jnp.array(_ACCELERATION) * dt
-    faster = driven / safe_dt - s.velocities[0]
+    faster = driven / safe_dt - speed
     faster = faster * jnp.minimum(1.0, gain[0] / jnp.maximum(safe_norm(faster), 1e-9))
-    velocity = jnp.where(odometry.valid, s.velocities[0] + faster, rotation(turn) @ s.velocities[0] * slower)
+    velocity = jnp.where(odometry.valid, speed + faster, rotation(turn) @ speed * slower)
     yaw_step = jnp.where(odometry.valid, odometry.increment[2], turn)
-    spun = s.yaw_rate + jnp.clip(odometry.increment[2] / safe_dt - s.yaw_rate, -gain[1], gain[1])
-    yaw_rate = jnp.where(odometry.valid, spun, s.yaw_rate * slower)
-    velocities = jnp.where(moving[:, None], s.velocities, 0.0).at[0].set(velocity)
-    steps = (velocities * coast).at[0].set(step)
-    map_step = s.map_error[2] * perpendicular(step)
-    return layout.pack(
-        Nodes(
-            positions=s.positions + steps,
-            velocities=velocities,
-            heading=s.heading + yaw_step,
-            yaw_rate=yaw_rate,
-            map_error=s.map_error.at[:2].add(map_step),
-        )
-    )
+    spun = rate + jnp.clip(odometry.increment[2] / safe_dt - rate, -gain[1], gain[1])
+    yaw_rate = jnp.where(odometry.valid, spun, rate * slower)
+    moved_error = error[:2] + error[2] * perpendicular(step)
+    turned = jnp.stack([heading + yaw_step, yaw_rate])
+    return jnp.concatenate([place + step, velocity, turned, moved_error, error[2:]])
 
 
 def process_noise(
@@ -110,23 +123,32 @@ def predict(
     """
     k = moving.shape[0]
     mean = transition(belief.mean, dt, odometry, moving)
-    F = jax.jacfwd(transition)(belief.mean, dt, odometry, moving)
+    F_robot = jax.jacfwd(_robot_transition)(_take_robot(belief.mean), dt, odometry)
+    coast = _coast(dt)
+
+    def carry(rows):
+        """F @ rows: a beacon's place moves by its velocity if it is carried, the robot's rows as its transition."""
+        velocities = jnp.where(jnp.repeat(moving, 2)[:, None], rows[2 * k : 4 * k], 0.0)
+        beacons = jnp.concatenate([rows[: 2 * k] + coast * velocities, velocities, rows[4 * k :]])
+        return _put_robot(beacons, F_robot @ _take_robot(rows))
+
+    cov = carry(carry(belief.cov).T)
     diagonal, coupling = process_noise(params, dt, odometry, moving)
-    pose = jnp.array(layout.pose_indices(k))
     jump = jnp.where(odometry.valid, 0.0, unrest)
-    diagonal = diagonal.at[pose].add(jump[jnp.array([0, 0, 1])])
-    rows = jnp.array(layout.map_error_indices(k))
-    Q = jnp.diag(diagonal.at[rows].add(1e-12))
-    at = jnp.concatenate([jnp.arange(2 * k), jnp.array([4 * k])])
-    to = jnp.concatenate([jnp.arange(2 * k, 4 * k), jnp.array([4 * k + 1])])
-    Q = Q.at[at, to].add(coupling[at]).at[to, at].add(coupling[at])
-    return _bounded(ekf.predict(belief, mean, F, Q), k)
+    every = jnp.arange(mean.shape[0])
+    pose, error = layout.pose_indices(k), every > 4 * k + 1
+    diagonal = diagonal + jnp.where(every < 2, jump[0], jnp.where(every == pose[2], jump[1], 0.0)) + 1e-12 * error
+    # a place is coupled to its velocity, which stands 2 K further on, the heading to the yaw rate next to it
+    partner = jnp.where(every < 2 * k, every + 2 * k, jnp.where(every == 4 * k, 4 * k + 1, -1))
+    pair = jnp.where(every[None, :] == partner[:, None], coupling[:, None], 0.0)
+    Q = jnp.where(every[:, None] == every[None, :], diagonal[:, None], 0.0) + pair + pair.T
+    return ekf.Gaussian(mean, _bounded((cov + cov.T) / 2 + Q, k))
 
 
-def _bounded(belief: ekf.Gaussian, k: int) -> ekf.Gaussian:
+def _bounded(cov: Float[Array, "n n"], k: int) -> Float[Array, "n n"]:
     """The robot's velocity, yaw rate and heading at most as uncertain as such a robot's can be."""
-    rows = jnp.array([2 * k, 2 * k + 1, 4 * k + 1, 4 * k])
-    most = jnp.array([_FASTEST[0], *_FASTEST]) ** 2
-    shrink = jnp.sqrt(jnp.minimum(1.0, most / jnp.diagonal(belief.cov)[rows]))
-    scale = jnp.ones(belief.cov.shape[0]).at[rows].set(shrink)
-    return ekf.Gaussian(belief.mean, belief.cov * (scale[:, None] * scale[None, :]))
+    most = np.zeros(cov.shape[0], np.float32)
+    most[[2 * k, 2 * k + 1, 4 * k + 1, 4 * k]] = np.array([_FASTEST[0], *_FASTEST]) ** 2
+    ratio = jnp.where(most > 0, most / jnp.diagonal(cov), 1.0)
+    scale = jnp.sqrt(jnp.minimum(1.0, ratio))
+    return cov * (scale[:, None] * scale[None, :])

@@ -10,6 +10,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float
 
 from uwbslam_jax import grid as occupancy
+from uwbslam_jax.geometry import transform_points
 
 
 def lidar_gram(
@@ -26,13 +27,11 @@ def lidar_gram(
     entry twice the LiDAR term. One product of a (4, B) by a (B, 4) matrix stands for B residuals of n unknowns.
     A beam without return or outside the window has residual 0.
     """
-    c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
-    dx = c * points[:, 0] - s * points[:, 1]
-    dy = s * points[:, 0] + c * points[:, 1]
-    ends = jnp.stack([pose[0] + dx, pose[1] + dy], axis=-1)
+    ends = transform_points(pose, points)
     corners, at, inside = occupancy.corner_log_odds(level, origin, size, ends)
     value, slope = occupancy.interpolate(jax.nn.sigmoid(corners), at, size)
     gx, gy = slope[:, 0], slope[:, 1]
+    dx, dy = ends[:, 0] - pose[0], ends[:, 1] - pose[1]
     rows = jnp.stack([-gx, -gy, gx * dy - gy * dx, 1.0 - value])
     rows = jnp.where(valid & inside, rows, 0.0)
     return rows @ rows.T

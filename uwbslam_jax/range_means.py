@@ -50,12 +50,11 @@ class Mean(NamedTuple):
 
 
 class _Heard(NamedTuple):
-    """One range of the robot: when [ns], where the antenna was on the map (2,), distance and scatter [m]."""
+    """One range of the robot: when [ns], where the antenna was on the map (2,), distance [m]."""
 
     stamp: float
     antenna: np.ndarray
     distance: float
-    scatter: float
 
 
 @dataclass
@@ -109,16 +108,15 @@ class RangeMeans:
                 self.pairs.setdefault((self.node(i), self.node(j)), deque(maxlen=_MOST)).append(distance)
                 continue
             then = pose + age * motion
-            newest = self._newest.setdefault(j, deque(maxlen=_WINDOW))
-            newest.append(distance)
-            heard = _Heard(frame.stamp + age * 1e9, then[:2] + turned(then[2], lever), distance, self._scatter(newest))
+            self._newest.setdefault(j, deque(maxlen=_WINDOW)).append(distance)
+            heard = _Heard(frame.stamp + age * 1e9, then[:2] + turned(then[2], lever), distance)
             self._open.setdefault(self.node(j), deque(maxlen=_MOST)).append(heard)
 
-    def _scatter(self, newest: deque[float]) -> float:
+    def _scatter(self, slot: int) -> float:
         """Standard deviation of a pair's newest ranges by their second differences, see keyframes [m]."""
-        if len(newest) < _WINDOW:
+        d = np.array(self._newest.get(slot, ()))
+        if len(d) < _WINDOW:
             return self.sigma_n
-        d = np.array(newest)
         # the median of |x| of a normal x is 0.674 sigma, and a second difference has 6 sigma^2
         return float(np.median(np.abs(d[2:] - 2 * d[1:-1] + d[:-2])) / (0.674 * np.sqrt(6.0)))
 
@@ -130,24 +128,25 @@ class RangeMeans:
         """
         span = max(stamps[1] - stamps[0], 1)
         for node, heard in self._open.items():
+            scatter = self._scatter(node[0])
             # two means in each interval: one would leave the keyframes free to move to and fro between their middles
             halves: dict[bool, list[_Heard]] = defaultdict(list)
             for one in heard:
                 halves[one.stamp - stamps[0] >= span / 2].append(one)
-            self.means += map(partial(self._mean, at, node, stamps[0], span, poses), halves.values())
+            self.means += map(partial(self._mean, at, node, stamps[0], span, poses, scatter), halves.values())
         self.drop()
 
     def drop(self) -> None:
         """Leave out what was heard since the last keyframe."""
         self._open.clear()
 
-    def _mean(self, at, node, start, span, poses, heard: list[_Heard]) -> Mean:
+    def _mean(self, at, node, start, span, poses, scatter, heard: list[_Heard]) -> Mean:
         distance = np.array([one.distance for one in heard])
         middle = np.sort(distance)[len(distance) // 2]  # one of them, so that at least one is near it
         ok = [one for one in heard if abs(one.distance - middle) < _WILD_M]
         share = np.clip((np.mean([one.stamp for one in ok]) - start) / span, 0.0, 1.0)
         antenna = np.mean([one.antenna for one in ok], axis=0)
         before, after = (turned(-pose[2], antenna - pose[:2]) for pose in poses)
-        sigma = mean_sigma(len(ok), float(np.median([one.scatter for one in heard])), self.sigma_n)
+        sigma = mean_sigma(len(ok), scatter, self.sigma_n)
         loud = sigma > mean_sigma(1, self.sigma_n, self.sigma_n)
         return Mean(at, node, float(share), before, after, float(np.mean([one.distance for one in ok])), sigma, loud)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from uwbslam_jax import ekf, layout
 from uwbslam_jax.config import Params
-from uwbslam_jax.geometry import rotation, safe_norm
+from uwbslam_jax.geometry import perpendicular
 from uwbslam_jax.measurements import Ranges
 
 _SOFT = 3.0
@@ -50,18 +49,50 @@ def predicted_ranges(vector: Float[Array, "n"], ranges: Ranges, params: Params) 
     The antenna's lever arm on the robot, the difference of antenna heights and the motion between exchange and
     frame are part of the model; two nodes at one place give a finite gradient.
     """
+    return _geometry(vector, ranges, params).predicted
+
+
+class _Geometry(NamedTuple):
+    """Of every exchange: its predicted range, unit vector in the plane, lever arm, and whose: +1 i's, -1 j's."""
+
+    predicted: Float[Array, "M"]
+    direction: Float[Array, "M 2"]
+    lever: Float[Array, "M 2"]
+    ends: Float[Array, "M K"]
+
+
+def _geometry(vector, ranges, params) -> _Geometry:
     s = layout.unpack(vector)
+    slot = jnp.arange(s.positions.shape[0])
+    i, j = ranges.i[:, None] == slot[None, :], ranges.j[:, None] == slot[None, :]
+    ends = i.astype(vector.dtype) - j.astype(vector.dtype)
+    angle = s.heading + s.yaw_rate * ranges.age
+    c, sn = jnp.cos(angle), jnp.sin(angle)
+    x, y = params.antenna[0], params.antenna[1]
+    lever = jnp.stack([c * x - sn * y, sn * x + c * y], axis=-1)
+    # differences of what every node has, one product for all of it
+    nodes = jnp.concatenate([s.positions, s.velocities, params.height[:, None]], axis=1)
+    apart = ends @ nodes
+    flat = apart[:, :2] + ranges.age[:, None] * apart[:, 2:4] + ends[:, :1] * lever
+    square = jnp.sum(flat**2, axis=-1) + apart[:, 4] ** 2
+    apart_at_all = square > 0
+    slant = jnp.where(apart_at_all, jnp.sqrt(jnp.where(apart_at_all, square, 1.0)), 0.0)
+    direction = jnp.where(apart_at_all[:, None], flat / jnp.where(apart_at_all, slant, 1.0)[:, None], 0.0)
+    bias = jnp.sum(jnp.where(i | j, params.bias[None, :], 0.0), axis=1)
+    return _Geometry((1.0 + params.bias_scale) * slant + bias, direction, lever, ends)
 
-    def at_exchange(slot, age):
-        lever = rotation(s.heading + s.yaw_rate * age) @ params.antenna[:2]
-        return s.positions[slot] + age * s.velocities[slot] + jnp.where(slot == 0, 1.0, 0.0) * lever
 
-    def one(i, j, age):
-        flat = safe_norm(at_exchange(i, age) - at_exchange(j, age))
-        rise = params.height[i] - params.height[j]
-        return (1.0 + params.bias_scale) * safe_norm(jnp.stack([flat, rise])) + params.bias[i] + params.bias[j]
-
-    return jax.vmap(one)(ranges.i, ranges.j, ranges.age)
+def linearised_ranges(
+    vector: Float[Array, "n"], ranges: Ranges, params: Params
+) -> tuple[Float[Array, "M"], Float[Array, "M n"]]:
+    """Predicted ranges and their Jacobian H, written out: a range depends on its own two nodes and on no other."""
+    g = _geometry(vector, ranges, params)
+    m, age = ranges.i.shape[0], ranges.age[:, None]
+    direction = (1.0 + params.bias_scale) * g.direction
+    places = (g.ends[:, :, None] * direction[:, None, :]).reshape(m, -1)
+    turning = g.ends[:, :1] * jnp.sum(direction * perpendicular(g.lever), axis=1, keepdims=True)
+    nothing = jnp.zeros((m, 3), vector.dtype)
+    return g.predicted, jnp.concatenate([places, age * places, turning, age * turning, nothing], axis=1)
 
 
 def line_of_sight(ranges: Ranges, nlos_gap_db: float) -> Bool[Array, "M"]:
@@ -143,8 +174,7 @@ def update(
     Args:
       scatter: of each pair, see learn_scatter; without `robust` it stays as it is and is not used.
     """
-    h = predicted_ranges(belief.mean, ranges, params)
-    H = jax.jacfwd(predicted_ranges)(belief.mean, ranges, params)
+    h, H = linearised_ranges(belief.mean, ranges, params)
     H = jnp.where(usable[:, None], H, 0.0)
     innovation = jnp.where(usable, ranges.range - h, 0.0)
     spread = jnp.sum((H @ belief.cov) * H, axis=1)

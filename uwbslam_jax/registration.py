@@ -113,7 +113,7 @@ def _residuals(old: View, points, valid, pose, scale):
     index = jnp.round(bearing / jnp.abs(sweep.bearing_step)).astype(jnp.int32)
     inside = index < sweep.points.shape[0]
     index = jnp.clip(index, 0, sweep.points.shape[0] - 1)
-    normal = perpendicular(surface.tangent[index])
+    normal = perpendicular(surface.tangent[:, index].T)
     apart = p - sweep.points[index]
     r = jnp.sum(normal * apart, axis=1)
     ok = valid & inside & sweep.valid[index] & surface.found[index]

@@ -115,14 +115,13 @@ def _thin(values: np.ndarray, count: int) -> np.ndarray:
     """Indices of at most about `count` values: the least and the greatest of each stretch."""
     if len(values) <= count:
         return np.arange(len(values))
-    keep: list[int] = []
-    for stretch in np.array_split(np.arange(len(values)), count // 2):
-        here = values[stretch]
-        if np.isfinite(here).any():
-            keep += sorted({int(stretch[np.nanargmin(here)]), int(stretch[np.nanargmax(here)])})
-        else:
-            keep.append(int(stretch[0]))
-    return np.array(keep)
+    width = -(-len(values) // (count // 2))
+    rows = np.full((-(-len(values) // width), width), np.nan)
+    rows.ravel()[: len(values)] = values
+    finite = np.isfinite(rows)
+    least, greatest = (np.where(finite, rows, -sign * np.inf) * sign for sign in (-1.0, 1.0))
+    begin = width * np.arange(len(rows))
+    return np.unique(np.concatenate([begin + least.argmax(1), begin + greatest.argmax(1)]))
 
 
 def _residuals(result: Result) -> dict[str, Any]:

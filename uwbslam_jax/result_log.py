@@ -6,7 +6,7 @@ import heapq
 import math
 import struct
 from collections.abc import Callable, Iterator
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,6 +33,8 @@ _POSE_TYPE, _TF_TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped", "tf2_msgs/
 _POSE = struct.Struct("<4siII4s7d36d")  # CDR, stamp, "map\0", position and orientation, covariance
 _TF = struct.Struct("<4sIiII4sI10s6x7d")  # CDR, one transform: stamp, "map\0", "base_link\0", padding, both vectors
 _CDR = b"\x00\x01\x00\x00"
+_PLANAR = [6 * row + column for row in (0, 1, 5) for column in (0, 1, 5)]
+_STAMPED = np.dtype([("time", "<u4", 2), ("length", "<u4"), ("frame", "S4"), ("pose", "<f8", 7)])  # PoseStamped
 
 
 class _Item(NamedTuple):
@@ -81,7 +83,7 @@ def crop(image: MapImage) -> MapImage:
 def _once(result: Result, start: int, known: np.ndarray) -> Iterator[_Item]:
     yield _Item(start, "/tf", lambda: _packed(_transform(start, UWB_FRAME, 0.0, 0.0, 0.0)))
     yield _Item(start, "/map", lambda: _packed(_grid(result.map, start)))
-    yield _Item(start, "/path", lambda: _packed(_path(result, start, known)))
+    yield _Item(start, "/path", lambda: _path(result, start, known))
 
 
 def _packed(message: Any) -> tuple[str, bytes]:
@@ -122,10 +124,11 @@ def _diagnostics(result: Result) -> Iterator[_Item]:
 
 def _pose(stamp: int, x: float, y: float, yaw: float, cov: np.ndarray) -> tuple[str, bytes]:
     """PoseWithCovarianceStamped; (3, 3) over x, y, yaw goes to rows and columns 0, 1, 5 of the 6 x 6."""
-    full = np.zeros((6, 6))
-    full[np.ix_([0, 1, 5], [0, 1, 5])] = np.nan_to_num(cov)  # RViz refuses a NaN
+    full = [0.0] * 36
+    for at, value in zip(_PLANAR, cov.ravel().tolist(), strict=True):
+        full[at] = value if math.isfinite(value) else 0.0  # RViz refuses a NaN
     place = x, y, 0.0, 0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)
-    return _POSE_TYPE, _POSE.pack(_CDR, *divmod(stamp, 1_000_000_000), 4, b"map", *place, *full.ravel().tolist())
+    return _POSE_TYPE, _POSE.pack(_CDR, *divmod(stamp, 1_000_000_000), 4, b"map", *place, *full)
 
 
 def _robot_transform(stamp: int, x: float, y: float, yaw: float) -> tuple[str, bytes]:
@@ -143,17 +146,19 @@ def _transform(stamp: int, child: str, x: float, y: float, yaw: float) -> Any:
     return build("tf2_msgs/msg/TFMessage", transforms=[stamped])
 
 
-def _path(result: Result, stamp: int, known: np.ndarray) -> Any:
-    """Path of every pose."""
-    poses = [
-        build(
-            "geometry_msgs/msg/PoseStamped",
-            header=header(int(result.stamps[index]), MAP_FRAME),
-            pose=pose(*result.poses[index].tolist()),
-        )
-        for index in known
-    ]
-    return build("nav_msgs/msg/Path", header=header(stamp, MAP_FRAME), poses=poses)
+def _path(result: Result, stamp: int, known: np.ndarray) -> tuple[str, bytes]:
+    """Path of every pose, packed."""
+    head = _CDR + struct.pack("<iII4sI", *divmod(stamp, 1_000_000_000), 4, b"map", len(known))
+    rows = np.zeros(len(known), _STAMPED)
+    rows["time"] = np.stack(np.divmod(result.stamps[known], 1_000_000_000), axis=-1)
+    rows["length"], rows["frame"] = 4, b"map"
+    x, y, yaw = result.poses[known].T
+    rows["pose"][:, 0], rows["pose"][:, 1] = x, y
+    rows["pose"][:, 5], rows["pose"][:, 6] = np.sin(yaw / 2), np.cos(yaw / 2)
+    body = rows.tobytes()
+    # numbers of eight bytes stand at multiples of eight: after the first pose's head there are four bytes of nothing
+    first = _STAMPED.fields["pose"][1] if len(known) else 0
+    return "nav_msgs/msg/Path", b"".join([head, body[:first], bytes(4) if first else b"", body[first:]])
 
 
 def _grid(image: MapImage, stamp: int) -> Any:
@@ -230,18 +235,28 @@ def _marker(
         pose=place,
         scale=vector("Vector3", *size),
         color=build("std_msgs/msg/ColorRGBA", **dict(zip("rgba", map(float, rgba), strict=True))),
-        lifetime=build("builtin_interfaces/msg/Duration", sec=0, nanosec=0),
-        frame_locked=False,
-        points=[],
-        colors=[],
-        texture_resource="",
-        texture=build("sensor_msgs/msg/CompressedImage", header=header(0, ""), format="", data=np.zeros(0, np.uint8)),
-        uv_coordinates=[],
         text=text,
-        mesh_resource="",
-        mesh_file=build("visualization_msgs/msg/MeshFile", filename="", data=np.zeros(0, np.uint8)),
-        mesh_use_embedded_materials=False,
+        **_plain_marker(),
     )
+
+
+@cache
+def _plain_marker() -> dict[str, Any]:
+    """The fields of a marker that ours leave empty; always the same, never changed."""
+    return {
+        "lifetime": build("builtin_interfaces/msg/Duration", sec=0, nanosec=0),
+        "frame_locked": False,
+        "points": [],
+        "colors": [],
+        "texture_resource": "",
+        "texture": build(
+            "sensor_msgs/msg/CompressedImage", header=header(0, ""), format="", data=np.zeros(0, np.uint8)
+        ),
+        "uv_coordinates": [],
+        "mesh_resource": "",
+        "mesh_file": build("visualization_msgs/msg/MeshFile", filename="", data=np.zeros(0, np.uint8)),
+        "mesh_use_embedded_materials": False,
+    }
 
 
 def _status(stamp: int, diagnostics: dict[str, np.ndarray], index: int) -> Any:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 from collections import Counter
 from collections.abc import Sequence
-from functools import partial
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -19,12 +19,13 @@ from jax import lax
 
 from uwbslam_jax import layout, slam, startup
 from uwbslam_jax.beacons import BeaconKeeper
-from uwbslam_jax.config import Params, Settings, make_config, make_params
+from uwbslam_jax.config import Config, Params, Settings, UwbSettings, make_config, make_params
 from uwbslam_jax.graph import Graph
 from uwbslam_jax.hindsight import Hindsight, Question, look_back
 from uwbslam_jax.history import History
 from uwbslam_jax.keyframes import Buffer
-from uwbslam_jax.measurements import Frame, StampedFrame
+from uwbslam_jax.measurements import Frame, StampedFrame, empty_frame
+from uwbslam_jax.packing import Packing
 from uwbslam_jax.range_means import Node, RangeMeans
 from uwbslam_jax.redraw import redraw
 from uwbslam_jax.revision import Reviser, is_news, take_over
@@ -42,16 +43,37 @@ TRACES: Counter[str] = Counter()
 """How often each compiled function was traced, by name; a test counts them."""
 
 
+def step_once(config: Config, params: Params, state: State, frame: Frame) -> tuple[State, Estimate]:
+    """One compiled step; the state's buffers are reused. The estimate is on the host."""
+    frames, estimates = _packings(config)
+    state, told = _step_once(config, params, state, frames.pack(frame))
+    return state, estimates.unpack(np.asarray(told))
+
+
+def step_many(config: Config, params: Params, state: State, frames: Sequence[Frame]) -> tuple[State, list[Estimate]]:
+    """Steps over frames in order, as one compiled scan."""
+    packing, estimates = _packings(config)
+    state, told = _step_many(config, params, state, np.stack([packing.pack(frame) for frame in frames]))
+    return state, [estimates.unpack(row) for row in np.asarray(told)]
+
+
+@cache
+def _packings(config: Config) -> tuple[Packing[Frame], Packing[Estimate]]:
+    """How the frames and the estimates of a configuration lie in vectors."""
+    frame, state = empty_frame(config.max_beams, config.max_ranges), jax.eval_shape(partial(slam.init, config))
+    params = jax.eval_shape(lambda: make_params(Settings(uwb=UwbSettings(max_beacons=config.nodes - 1))))
+    _, estimate = jax.eval_shape(partial(slam.step, config), params, state, frame)
+    return Packing(frame), Packing(estimate)
+
+
 @partial(jax.jit, static_argnums=0, donate_argnums=2)
-def step_once(config, params, state: State, frame: Frame) -> tuple[State, Estimate]:
-    """One compiled step; the state's buffers are reused."""
+def _step_once(config, params, state, frame):
     TRACES["step_once"] += 1
     return _guarded(config, params, state, frame)
 
 
 @partial(jax.jit, static_argnums=0, donate_argnums=2)
-def step_many(config, params, state: State, frames: Frame) -> tuple[State, Estimate]:
-    """Steps over frames stacked along their first axis, as one compiled scan."""
+def _step_many(config, params, state, frames):
     TRACES["step_many"] += 1
     return lax.scan(lambda s, f: _guarded(config, params, s, f), state, frames)
 
@@ -59,7 +81,9 @@ def step_many(config, params, state: State, frames: Frame) -> tuple[State, Estim
 def _guarded(config, params, state, frame):
     # without the barriers the compiler fuses the step with the loop around it and rounds differently there
     state, frame = lax.optimization_barrier((state, frame))
-    return lax.optimization_barrier(slam.step(config, params, state, frame))
+    frames, estimates = _packings(config)
+    state, estimate = lax.optimization_barrier(slam.step(config, params, state, frames.unpack(frame)))
+    return state, estimates.pack_device(estimate)
 
 
 class Session:
@@ -99,6 +123,7 @@ class Session:
         self._reviser = Reviser()
         self._places: dict[Node, np.ndarray] = {}
         self._frame_nodes: tuple[Node, Node] = ((0, 0), (0, 0))
+        self._copied: tuple[Params | None, Params] = (None, self.params)
 
     @property
     def slots(self) -> dict[int, int]:
@@ -113,7 +138,6 @@ class Session:
         """One frame in, its estimate out (numpy)."""
         self._learn_slots(frame)
         self.state, estimate = step_once(self.config, self.params, self.state, frame.frame)
-        estimate = jax.device_get(estimate)
         self._take(frame, estimate)
         return estimate
 
@@ -122,10 +146,7 @@ class Session:
         if len(frames) != CONTROL_EVERY or self._pending:
             return [self.step(frame) for frame in frames]
         self._learn_slots(frames[-1])
-        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *[f.frame for f in frames])
-        self.state, many = step_many(self.config, self.params, self.state, stacked)
-        many = jax.device_get(many)
-        estimates = [jax.tree.map(lambda leaf, k=k: leaf[k], many) for k in range(len(frames))]
+        self.state, estimates = step_many(self.config, self.params, self.state, [f.frame for f in frames])
         for frame, estimate in zip(frames, estimates, strict=True):
             self._take(frame, estimate)
         return estimates
@@ -139,7 +160,7 @@ class Session:
         self.hindsight = None if question is None else look_back(question, self.history)
         if self.hindsight is None:
             return
-        self._learn_biases(self.hindsight.solution, self.history.stamps[-1])
+        self._learn_biases(self.hindsight.solution, int(self.history.stamps[-1]))
         seen = self.graph.seen(self.hindsight.solution.poses)
         robot = self.hindsight.track[-1, :2]
         self.state = self.state._replace(grid=redraw(self.config, self.params, self.tiles, seen, robot))
@@ -153,7 +174,7 @@ class Session:
         places = self._places | {
             self.graph.ranges.node(slot): positions[slot] for slot in map(int, np.flatnonzero(resting)) if slot > 0
         }
-        poses = np.array([self.history.poses[key.frame] for key in self.graph.keyframes]).reshape(-1, 3)
+        poses = self.history.poses[[key.frame for key in self.graph.keyframes]]
         configured = make_params(self.settings, self._slots)
         return Question(self.graph.copy(), poses, places, configured, self._frame_nodes, bool(self.found_bias))
 
@@ -187,13 +208,13 @@ class Session:
         first = len(self.history.stamps) - len(pending)
         numbered = [(first + k, frame, estimate) for k, (frame, estimate) in enumerate(pending)]
         if self._looks_back:
-            self.graph.add(self.config, self.params, numbered)
+            self.graph.add(self.config, self._params_on_host(), numbered)
         if not self.settings.filter.lidar_only:
             if self.decided_at is None:
                 self._start_up(pending)
             else:
                 self._keep_beacons(pending)
-        robot = np.asarray(self.state.belief.mean[:2], float)
+        robot = np.asarray(self.state.belief.mean)[:2].astype(float)
         origin = np.asarray(self.state.grid.origin, float)
         if self.tiles.needs_move(origin, self.config.cells, robot):
             self.state = self.state._replace(grid=self.tiles.recentre(self.state.grid, robot))
@@ -233,7 +254,8 @@ class Session:
 
     def _keep_beacons(self, pending: list[tuple[StampedFrame, Estimate]]) -> None:
         ids = {slot: node for node, slot in self._slots.items()}
-        self.state, events = self._keeper.look(self.state, self.params, pending)
+        params = self._params_on_host()
+        self.state, events = self._keeper.look(self.state, params, pending)
         for slot, text in events:
             who = "robot" if slot == 0 else f"beacon {ids[slot]}"
             self.history.event(pending[-1][0].stamp, f"{who} {text}")
@@ -241,6 +263,11 @@ class Session:
         if any(slot == 0 for slot, _ in events):
             self._reviser.drop()
         self._revise(pending[-1][0].stamp)
+
+    def _params_on_host(self) -> Params:
+        if self._copied[0] is not self.params:
+            self._copied = (self.params, jax.device_get(self.params))
+        return self._copied[1]
 
     def _remember(self, slot: int, text: str, now: int) -> None:
         """What an event means for the run as a whole."""

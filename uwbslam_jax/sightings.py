@@ -45,6 +45,8 @@ _WALL_COST = 6.0
 """Log-likelihood that it costs to say that a wall has come between two nodes."""
 _WALL_M = 3.0
 """No wall makes ranges too long by more than this, for long."""
+_NOISE = 3.0
+"""Sum of squares of whitened residuals beyond its mean that is still taken for noise [standard deviations]."""
 _SUPPORTS = 0.5
 """Share of `DECIDED` by which an explanation must still win without the node that speaks for it the loudest."""
 
@@ -234,7 +236,7 @@ def judge(sightings: Sightings, known: Known, slot: int, velocity: np.ndarray) -
     off = distance - np.linalg.norm(here - at, axis=1)
     bias = float(np.median(off)) if len(rows) else 0.0
     as_it_is = misfit(here, at, distance, sigma)
-    if len(rows) < 5 or as_it_is.sum() < DECIDED:
+    if len(rows) < 5 or as_it_is.sum() < DECIDED or _is_noise(here, at, off / sigma, sigma, time):
         return Verdict(True, None, rows, bias)
     biased = as_it_is - misfit(here, at, distance - bias, sigma)
     spots = _moving_fits(rows, known, known.places[slot])
@@ -246,6 +248,20 @@ def judge(sightings: Sightings, known: Known, slot: int, velocity: np.ndarray) -
     if several and _decides(moved, rows) and moved.sum() > biased.sum() + DECIDED:
         return Verdict(False, spot, rows, bias)
     return Verdict(not (_decides(moved, rows) or _decides(biased, rows)), None, rows, bias)
+
+
+def _is_noise(here: np.ndarray, at: np.ndarray, whitened: np.ndarray, sigma: np.ndarray, time: np.ndarray) -> bool:
+    """Whether rows scatter about a place (R, 2) as their noise lets them, and neither another place, nor a velocity,
+    nor a bias could explain them much better: what it can gain is that of the linear problem. So much cheaper than to
+    fit them all that it is asked first."""
+    square = float(whitened @ whitened)
+    if square > len(whitened) + _NOISE * np.sqrt(2.0 * len(whitened)):
+        return False
+    u = here - at
+    u = u / np.maximum(np.sqrt((u**2).sum(1)), 1e-6)[:, None]
+    J = np.column_stack([u, time[:, None] * u, np.ones(len(u))]) / sigma[:, None]
+    pull = J.T @ whitened
+    return float(pull @ np.linalg.solve(J.T @ J + 1e-6 * np.eye(5), pull)) < DECIDED
 
 
 def resting_elsewhere(sightings: Sightings, known: Known, slot: int) -> tuple[Spot, np.ndarray] | None:

@@ -32,14 +32,14 @@ _LOST_SCORE = 0.5
 _FINE_SCORE = 0.8
 _WIDE_HEADING = 0.15
 """A heading less certain than this [rad] is searched for unless the scan fits finely where it was expected."""
-_FEWEST_RETURNS = 20
-"""A scan of fewer returns is not worth a search."""
+_FEWEST_RETURNS = 20  # a scan of fewer is not worth a search
 _ALIGN_FLOOR = (0.1, 0.1, 0.05)
 """Alignment is LiDAR's business: the prior that holds it is never tighter than this [m, m, rad]."""
+_NEAR_REACH = 5.0
+"""Walls so far away are hit by a beam within a cell where the heading is known that well [m]."""
 _DRAW_MOVED = (0.1, 0.05)
 """A scan is drawn when the robot has moved or turned this much since the last one [m, rad]."""
-_DRAW_FIRST = 10
-"""The first scans are all drawn: there is no map yet to be blurred."""
+_DRAW_FIRST = 10  # the first scans are all drawn: there is no map yet to be blurred
 _NEW_GROUND = 0.02
 """Share of new ground in a scan from which on it is drawn where the ranges say, not where the old map says."""
 _DRAW_PULL = (0.003, 0.0003)
@@ -149,10 +149,11 @@ def step(config: Config, params: Params, state: State, frame: Frame) -> tuple[St
         belief = paper.heading_from_velocity(paper.pin_frame(belief, state.frame_slots))
     s = layout.unpack(belief.mean)
     sweep = undo_motion(frame.scan, params.lidar, rotation(-s.heading) @ s.velocities[0], s.yaw_rate)
+    surface = matching.surface(sweep)
     align = _joint_match if config.preset == "paper" else _match_and_fuse
-    belief, matched = align(config, params, state, belief, frame, sweep, usable)
+    belief, matched = align(config, params, state, belief, frame, sweep, surface, usable)
     state = state._replace(belief=belief, unrest=matched.unrest, map_spread=matched.map_spread)
-    state, drawn = _draw(config, state, matched, sweep)
+    state, drawn = _draw(config, state, matched, sweep, surface)
     return state, _report(state, matched, used, drawn)
 
 
@@ -180,9 +181,9 @@ class _Matched(NamedTuple):
     map_spread: trust.MapSpread
 
 
-def _match_and_fuse(config, params, state, belief, frame, sweep, usable) -> tuple[Gaussian, _Matched]:
+def _match_and_fuse(config, params, state, belief, frame, sweep, surface, usable) -> tuple[Gaussian, _Matched]:
     """Preset "robust": align the scan fully, search where that fails, fuse what it is worth (DESIGN 1.8, 1.9)."""
-    match, searched = _match(config, params, state, belief, sweep, frame.has_scan)
+    match, searched = _match(config, params, state, belief, sweep, surface, frame.has_scan)
     seen = jnp.where(frame.has_scan & _map_errs(config, state), _epoch_seen(config, state.grid, sweep, match.pose), 0.0)
     belief, spread = trust.revisit(belief, state.map_spread, seen, params)
     lost = (match.known > _KNOWN_ENOUGH) & (match.score < _LOST_SCORE)
@@ -207,11 +208,12 @@ def _match_and_fuse(config, params, state, belief, frame, sweep, usable) -> tupl
 
 
 def _expected_fit(config, state, belief, sweep) -> Float[Array, ""]:
-    score, known = matching.fit(state.grid, sweep, trust.expected_match(belief), config.resolution)
+    few = matching.thinned(sweep)
+    score, known = matching.fit(state.grid, few, trust.expected_match(belief), config.resolution)
     return score * known
 
 
-def _joint_match(config, params, state, belief, frame, sweep, usable) -> tuple[Gaussian, _Matched]:
+def _joint_match(config, params, state, belief, frame, sweep, surface, usable) -> tuple[Gaussian, _Matched]:
     """Preset "paper": offset of all nodes and the heading by the joint objective, then the correction."""
     offset = jnp.zeros(2 * config.nodes + 1, belief.mean.dtype)
     if config.scan_matching:
@@ -220,7 +222,7 @@ def _joint_match(config, params, state, belief, frame, sweep, usable) -> tuple[G
         offset = jnp.where(frame.has_scan, offset, 0.0)
     corrected = paper.correct(belief, offset)
     pose = layout.robot_pose(corrected.mean)
-    match = matching.assess(state.grid, sweep, matching.surface(sweep), pose, config.resolution)
+    match = matching.assess(state.grid, sweep, surface, pose, config.resolution)
     no = jnp.zeros((), bool)
     matched = _Matched(match, jnp.zeros((3, 3)), no, no, frame.has_scan, state.unrest, state.map_spread)
     return corrected if config.correction else belief, matched
@@ -246,13 +248,14 @@ def undo_motion(scan: Scan, lidar: Float[Array, "3"], velocity: Float[Array, "2"
     return Sweep(points, scan.valid, lidar, scan.angle_min, step, reach)
 
 
-def _match(config, params, state, belief, sweep, has_scan) -> tuple[Match, Bool[Array, ""]]:
+def _match(config, params, state, belief, sweep, surface, has_scan) -> tuple[Match, Bool[Array, ""]]:
     C = layout.matched_pose_jacobian(config.nodes)
     prior = Gaussian(C @ belief.mean, C @ belief.cov @ C.T + jnp.diag(jnp.array(_ALIGN_FLOOR) ** 2))
     start = prior.mean
-    surface = matching.surface(sweep)
     blind = matching.blind_direction(surface, sweep.valid)
-    pose = matching.align(state.grid, sweep, blind, start, prior, params.sigma_l, config.resolution)
+    cell = config.resolution * jnp.array([1.0, 1.0, 1.0 / _NEAR_REACH])
+    near = jnp.all(jnp.diagonal(prior.cov) < jnp.array(_ALIGN_FLOOR) ** 2 + cell**2)
+    pose = matching.align(state.grid, sweep, blind, start, prior, params.sigma_l, config.resolution, near)
     match = matching.assess(state.grid, sweep, surface, pose, config.resolution)
     unsure = (belief.cov[4 * config.nodes, 4 * config.nodes] > _WIDE_HEADING**2) | trust.restless(state.unrest)
     fits = match.score > jnp.where(unsure, _FINE_SCORE, _POOR_SCORE)
@@ -271,7 +274,7 @@ def _match(config, params, state, belief, sweep, has_scan) -> tuple[Match, Bool[
     return lax.cond(wanted, wide, lambda _: match, None), wanted
 
 
-def _draw(config, state, matched: _Matched, sweep) -> tuple[State, Bool[Array, ""]]:
+def _draw(config, state, matched: _Matched, sweep, surface) -> tuple[State, Bool[Array, ""]]:
     """The map with the scan drawn, when it may be and the robot has moved or turned since the last one.
 
     New ground is drawn at a known place, so what the map errs by there is known to be the pose's own error.
@@ -280,29 +283,26 @@ def _draw(config, state, matched: _Matched, sweep) -> tuple[State, Bool[Array, "
     moved = jnp.hypot(*(pose[:2] - state.drawn_pose[:2])) > _DRAW_MOVED[0]
     turned = jnp.abs(wrap_angle(pose[2] - state.drawn_pose[2])) > _DRAW_MOVED[1]
     wanted = matched.trusted & (moved | turned | (state.scans_drawn < _DRAW_FIRST))
-    new = _on_new_ground(config, state.grid, sweep, pose)
-    novelty = jnp.sum(new) / jnp.maximum(jnp.sum(sweep.valid), 1)
-    limit = jnp.array([_DRAW_PULL[0], _DRAW_PULL[0], _DRAW_PULL[1]])
-    pull = jnp.clip(layout.unpack(state.belief.mean).map_error, -limit, limit)
-    at = pose - jnp.minimum(1.0, novelty / _NEW_GROUND) * pull
-    grid = lax.cond(
-        wanted,
-        lambda g: occupancy.integrate(g, at, sweep, config.resolution, state.map_spread.way),
-        lambda g: g,
-        state.grid,
-    )
-    way = jnp.where(wanted, safe_norm(pose[:2] - state.drawn_pose[:2]), 0.0)
-    share = jnp.zeros((3, 3)).at[2, 2].set(novelty)
-    share = share.at[:2, :2].set(matching.share_of_walls(matching.surface(sweep), new, sweep.valid, pose[2]))
-    share = jnp.where(wanted & _map_errs(config, state), share, 0.0)
-    state = state._replace(
-        belief=trust.anchor(state.belief, at, share),
-        map_spread=trust.learn_spread(state.map_spread, state.belief, share, way),
-        grid=grid,
-        drawn_pose=jnp.where(wanted, pose, state.drawn_pose),
-        scans_drawn=state.scans_drawn + wanted,
-    )
-    return state, wanted
+
+    def drawn(state: State) -> State:
+        new = _on_new_ground(config, state.grid, sweep, pose)
+        novelty = jnp.sum(new) / jnp.maximum(jnp.sum(sweep.valid), 1)
+        limit = jnp.array([_DRAW_PULL[0], _DRAW_PULL[0], _DRAW_PULL[1]])
+        pull = jnp.clip(layout.unpack(state.belief.mean).map_error, -limit, limit)
+        at = pose - jnp.minimum(1.0, novelty / _NEW_GROUND) * pull
+        walls = matching.share_of_walls(surface, new, sweep.valid, pose[2])
+        share = jnp.zeros((3, 3)).at[2, 2].set(novelty).at[:2, :2].set(walls)
+        share = jnp.where(_map_errs(config, state), share, 0.0)
+        way = safe_norm(pose[:2] - state.drawn_pose[:2])
+        return state._replace(
+            belief=trust.anchor(state.belief, at, share),
+            map_spread=trust.learn_spread(state.map_spread, state.belief, share, way),
+            grid=occupancy.integrate(state.grid, at, sweep, config.resolution, state.map_spread.way),
+            drawn_pose=pose,
+            scans_drawn=state.scans_drawn + 1,
+        )
+
+    return lax.cond(wanted, drawn, lambda state: state, state), wanted
 
 
 def _map_errs(config, state):

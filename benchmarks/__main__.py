@@ -1,0 +1,53 @@
+"""Speed: `python -m benchmarks NAME` measures one thing, prints and writes results/NAME.md and .json.
+
+With --gate the exit status is 1 where a figure misses its bar, or a ratio is worse than the committed baseline by more
+than its tolerance; --baseline puts this run's ratios into the baseline. How far off the answers are is
+`python -m benchmarks.scenarios` and `.recordings`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+
+from benchmarks.metric import judge, publish
+from uwbslam_jax.__main__ import prepare
+
+NAMES = {
+    "step": "one online step beside KISS-ICP on the same scans",
+    "scaling": "a step against beacons, beams, size of the map and levels",
+    "batch": "a whole recording of ten minutes, and many parameter sets at once",
+    "uwb": "the filter on ranges alone beside GTSAM",
+    "startup": "from the shell to the first pose",
+    "gpu": "many runs at once on a graphics card",
+}
+
+
+def main() -> int:
+    """Returns 0, or 1 where the gate is shut."""
+    prepare()  # before JAX is imported, which reads it once
+    told = "\n".join(f"  {name:<8} {about}" for name, about in NAMES.items())
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks", description=f"{__doc__}\n{told}", formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("name", choices=NAMES, metavar="NAME")
+    parser.add_argument("--gate", action="store_true", help="exit 1 where a bar or the baseline is missed")
+    parser.add_argument("--baseline", action="store_true", help="make this run's ratios the baseline")
+    parser.add_argument("--quick", action="store_true", help="less of everything, to try it out: nothing is written")
+    options = parser.parse_args()
+    report = importlib.import_module(f"benchmarks.speed_{options.name}").measure(quick=options.quick)
+    if options.quick:
+        for m in report.metrics:
+            print(f"{m.name}: {m.value:.4g} {m.unit}")
+        print(report.skipped)
+        return 0
+    print(publish(options.name, report))
+    failed = judge(options.name, report, renew=options.baseline)
+    for text in failed:
+        print(text, file=sys.stderr)
+    return int(bool(failed) and options.gate)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,154 @@
+"""One online step over the hall at 40 Hz: the whole of it, its parts, and KISS-ICP on the same scans in turn."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks.metric import Metric, Report, ratio, spread
+from uwbslam_jax import grid, layout, matching, motion, ranging, session, slam
+from uwbslam_jax.config import Settings
+from uwbslam_jax.frames import FrameAssembler
+from uwbslam_jax.geometry import rotation
+from uwbslam_jax.measurements import StampedFrame
+from uwbslam_jax.run import fit_beams
+from uwbslam_jax.session import Session
+from uwbslam_jax.settings_file import from_dict
+from uwbslam_jax.simulate import scenario, settings_overrides, simulate
+
+_SECONDS = 150.0
+_WARM = 400
+"""First steps left out: compilation, start-up, the first map."""
+_REPEATS = 300
+
+
+def frames_of(name: str, seconds: float) -> tuple[Settings, list[StampedFrame]]:
+    """The frames of a scenario's first seed, with the settings that they were made for."""
+    made = scenario(name, 0, seconds)
+    messages = list(simulate(made))
+    settings = fit_beams(from_dict(settings_overrides(made)), messages)
+    assembler = FrameAssembler(settings, Session(settings).config.max_ranges)
+    return settings, [frame for message in messages for frame in assembler.add(message)]
+
+
+def measure(*, quick: bool) -> Report:
+    """Online steps, every 400th apart; KISS-ICP registers the scan of each step right after it."""
+    settings, frames = frames_of("hall40", 30.0 if quick else _SECONDS)
+    run, peer = Session(settings), _kiss_icp()
+    compiled: list[float] = []
+    original = session._step_once
+
+    def timed(*arguments):
+        begin = time.perf_counter()
+        told = jax.block_until_ready(original(*arguments))
+        compiled.append(time.perf_counter() - begin)
+        return told
+
+    whole, theirs, drawn = [], [], []
+    session._step_once = timed
+    try:
+        for frame in frames:
+            begin = time.perf_counter()
+            estimate = run.step(frame)
+            whole.append(time.perf_counter() - begin)
+            drawn.append(bool(estimate.drawn))
+            if peer is not None and frame.frame.has_scan:
+                theirs.append(peer(frame))
+    finally:
+        session._step_once = original
+    ours, inside = np.array(whole[_WARM:]), np.array(compiled[_WARM:])
+    metrics = spread("step", ours, median=0.5, p95=2.0, p99=5.0)
+    metrics += [
+        Metric("step, least", 1e3 * float(ours.min()), "ms", "lower"),
+        Metric("of it: on the host, median", 1e3 * float(np.median(ours - inside)), "ms", "lower"),
+        Metric("of it: compiled, scan drawn, median", 1e3 * float(np.median(inside[drawn[_WARM:]])), "ms", "lower"),
+    ]
+    metrics += [Metric(f"by itself: {part}, median", 1e3 * t, "ms", "lower") for part, t in _parts(run, frames)]
+    if peer is not None:
+        kiss = np.array(theirs[_WARM:])
+        metrics += spread("KISS-ICP", kiss)[:3]
+        share = float(np.median(ours) / np.median(kiss))
+        metrics.append(ratio("step / KISS-ICP, medians", share, bar=0.8))
+    about = (
+        f"{len(ours)} steps of the hall at 40 Hz, 1081 beams, five beacons that range in all pairs, three levels, map "
+        "updates and the host's own work included, one by one as on the robot. KISS-ICP (C++, one thread, default "
+        "settings for this range) registers the same scan right after each step, so both meet the same machine. The "
+        "parts are compiled by themselves; together they share work."
+    )
+    return Report("One online step", about + ("" if peer else " KISS-ICP is not installed: left out."), metrics)
+
+
+def _kiss_icp() -> Callable[[StampedFrame], float] | None:
+    """Seconds that KISS-ICP takes for a frame's scan; None where it is not installed."""
+    try:
+        from kiss_icp.config import KISSConfig
+        from kiss_icp.kiss_icp import KissICP
+    except ImportError:
+        return None
+    config: Any = KISSConfig()
+    config.data.max_range, config.data.min_range, config.data.deskew = 30.0, 0.1, False
+    config.mapping.voxel_size = 0.3
+    config.registration.max_num_threads = 1
+    odometry = KissICP(config)
+
+    def register(frame: StampedFrame) -> float:
+        scan = frame.frame.scan
+        beam = np.flatnonzero(scan.valid)
+        bearing = float(scan.angle_min) + float(scan.angle_increment) * beam
+        reach = scan.ranges[beam].astype(float)
+        points = np.column_stack([reach * np.cos(bearing), reach * np.sin(bearing), np.zeros(len(beam))])
+        begin = time.perf_counter()
+        odometry.register_frame(points, np.zeros(len(beam)))
+        return time.perf_counter() - begin
+
+    return register
+
+
+def _parts(run: Session, frames: list[StampedFrame]) -> list[tuple[str, float]]:
+    """Median seconds of the step's parts, each compiled alone, on the state at the end of a run."""
+    config, params, frame = run.config, run.params, jax.tree.map(jnp.asarray, frames[-1].frame)
+    state = run.state
+    s = layout.unpack(state.belief.mean)
+    sweep = slam.undo_motion(frame.scan, params.lidar, rotation(-s.heading) @ s.velocities[0], s.yaw_rate)
+    usable = slam._usable(config, state, frame)
+
+    def filtered(state, frame):
+        belief = motion.predict(state.belief, params, frame.dt, frame.odometry, state.moving, state.unrest)
+        return ranging.update(belief, frame.ranges, usable, params, state.scatter, robust=True)
+
+    def matched(state, sweep):
+        surface = matching.surface(sweep)
+        return slam._match(config, params, state, state.belief, sweep, surface, frame.has_scan)
+
+    def redrawn(window, pose):
+        return grid.integrate(window, pose, sweep, config.resolution)
+
+    draw = jax.jit(redrawn, donate_argnums=0)
+    window, pose = jax.tree.map(jnp.array, state.grid), layout.robot_pose(state.belief.mean)
+    times: list[float] = []
+    for _ in range(_REPEATS):
+        begin = time.perf_counter()
+        window = jax.block_until_ready(draw(window, pose))
+        times.append(time.perf_counter() - begin)
+    return [
+        ("prediction and ranges", repeated(partial(jax.jit(filtered), state, frame))),
+        ("match", repeated(partial(jax.jit(matched), state, sweep))),
+        ("drawing a scan", float(np.median(times[5:]))),
+    ]
+
+
+def repeated(call: Callable[[], Any], count: int = _REPEATS) -> float:
+    """Median seconds of a compiled call."""
+    jax.block_until_ready(call())
+    times = []
+    for _ in range(count):
+        begin = time.perf_counter()
+        jax.block_until_ready(call())
+        times.append(time.perf_counter() - begin)
+    return float(np.median(times))
