@@ -219,7 +219,7 @@ def test_gradient_of_an_alignment_agrees_with_finite_differences(room_map):
 
 def test_from_nearby_fewer_beams_and_moves_find_the_same_place(room_map):
     truth = np.array([0.33, -0.41, 0.6])
-    sweep, start = sweep_at(truth, 1081), jnp.asarray(truth + [0.02, -0.015, 0.004], jnp.float32)
+    sweep, start = sweep_at(truth, 1081), jnp.asarray(truth + np.array([0.02, -0.015, 0.004]), jnp.float32)
     found = [
         matching.align(
             room_map, sweep, blind_direction(sweep), start, wide(start), jnp.float32(SIGMA_L), RESOLUTION, near

@@ -5,6 +5,8 @@ A few numbers a frame in arrays, so that memory grows by about 120 bytes a frame
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from uwbslam_jax.measurements import StampedFrame
@@ -39,6 +41,9 @@ class Column:
 
     def __getitem__(self, index):
         return self.values[index]
+
+    def __iter__(self) -> Iterator:
+        return iter(self.values)
 
     def __array__(self, dtype=None, copy=None) -> np.ndarray:
         return np.array(self.values, dtype)
@@ -94,7 +99,7 @@ class History:
     def _keep_beacons(self) -> None:
         if self._seen is not None:
             for slot in np.flatnonzero(self._seen.active[1:]) + 1:
-                self.left[int(slot)] = self._seen.beacons[slot].copy(), self._seen.beacon_covs[slot].copy()
+                self.left[int(slot)] = np.array(self._seen.beacons[slot]), np.array(self._seen.beacon_covs[slot])
 
     @property
     def diagnostics(self) -> dict[str, np.ndarray]:
