@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from dataclasses import asdict, dataclass, replace
 from typing import Literal
 
@@ -102,7 +103,8 @@ def table(report: Report, facts: dict[str, str]) -> str:
 
 def publish(name: str, report: Report) -> str:
     """Writes the table and the figures of a benchmark and returns the table."""
-    facts = provenance(workers=1)
+    # above a load of 1 other work has slowed this down: then only least times and ratios tell something
+    facts = provenance(workers=1) | {"machine load": f"{os.getloadavg()[0]:.1f}"}
     text = table(report, facts)
     write(name, text, {"provenance": facts, **plain(asdict(report))})
     return text

@@ -215,3 +215,17 @@ def test_gradient_of_an_alignment_agrees_with_finite_differences(room_map):
     truth = jnp.array([0.33, -0.41, 0.6])
     at = (truth + 0.05, truth + jnp.array([0.06, -0.03, 0.02]), grid.levels[0], jnp.array(SIGMA_L))
     assert_gradient(value, at, rtol=1e-4, atol=1e-7, step=1e-7, forward=False, count=4)
+
+
+def test_from_nearby_fewer_beams_and_moves_find_the_same_place(room_map):
+    truth = np.array([0.33, -0.41, 0.6])
+    sweep, start = sweep_at(truth, 1081), jnp.asarray(truth + np.array([0.02, -0.015, 0.004]), jnp.float32)
+    found = [
+        matching.align(
+            room_map, sweep, blind_direction(sweep), start, wide(start), jnp.float32(SIGMA_L), RESOLUTION, near
+        )
+        for near in (False, True)
+    ]
+    for pose in found:
+        np.testing.assert_allclose(pose, truth, atol=0.01)  # a tenth of a cell, half of what is asked from afar
+    assert len(matching.thinned(sweep, 540).valid) < 600

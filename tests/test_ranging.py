@@ -265,3 +265,16 @@ def test_gradient_of_one_filter_step_agrees_with_finite_differences(params, robu
     at = (belief.mean, jnp.linalg.cholesky(belief.cov), ranges.range, {n: getattr(params, n) for n in names})
     gradient = assert_gradient(value, at, rtol=1e-5)
     assert all(np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(gradient))
+
+
+@pytest.mark.usefixtures("x64")
+def test_the_jacobian_that_is_written_out_is_that_of_the_model():
+    params = double(flat_params())._replace(
+        antenna=jnp.array([0.2, -0.1]), bias_scale=jnp.array(0.03), height=jnp.linspace(0.0, 1.0, 4)
+    )
+    rng = np.random.default_rng(0)
+    at = jnp.asarray(rng.normal(size=vector().shape[0]))
+    ranges = measured(np.ones(6), np.linspace(-0.05, 0.0, 6))
+    h, H = jax.jit(ranging.linearised_ranges)(at, ranges, params)
+    np.testing.assert_allclose(h, ranging.predicted_ranges(at, ranges, params), rtol=1e-12)
+    np.testing.assert_allclose(H, jax.jacfwd(ranging.predicted_ranges)(at, ranges, params), atol=1e-9)

@@ -211,3 +211,13 @@ def test_lidar_only_needs_no_beacon():
     c, s = np.cos(first[2]), np.sin(first[2])
     want = (pose_at(drive.time)[:2] - first[:2]) @ np.array([[c, -s], [s, c]])
     np.testing.assert_allclose(last.pose[:2], want, atol=0.1)  # a cell
+
+
+def test_the_map_is_drawn_where_it_is():
+    """A step that draws copies no level of the map: its buffers are those that were handed in."""
+    run = Session(SETTINGS)
+    frames = Drive(run).frames(4, (10,))
+    run.step(frames[0])
+    before = [level.unsafe_buffer_pointer() for level in run.state.grid.levels]
+    assert all(bool(run.step(frame).drawn) for frame in frames[1:])
+    assert [level.unsafe_buffer_pointer() for level in run.state.grid.levels] == before

@@ -165,3 +165,21 @@ def test_memory_is_bounded_and_one_node_can_be_forgotten():
     heard = rows(at_rest, straight, 10.0)
     heard.forget(other=1)
     assert set(heard.since(0.0)[:, s.OTHER]) == {0, 2}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_is_taken_for_noise_at_first_sight_would_be_found_to_fit(seed, monkeypatch):
+    """The cheap question spares the dear one, and answers as it does; what moves or is biased is never noise."""
+    resting = rows(lambda t: PLACES[3], at_rest, 1.0, seed=seed)
+    carried = rows(lambda t: PLACES[3] + np.array([0.9 * t, 0.0]), at_rest, 1.0, seed=seed)
+    late = rows(lambda t: PLACES[3] + np.array([0.6, 0.0]), at_rest, 1.0, seed=seed)
+    asked = []
+    dear = s._moving_fits
+    monkeypatch.setattr(s, "_moving_fits", lambda *a: asked.append(1) or dear(*a))
+    for made, noise in ((resting, True), (carried, False), (late, False)):
+        asked.clear()
+        verdict = s.judge(made, known(1.0), 3, np.zeros(2))
+        assert (not asked) == noise
+        assert verdict.fits or not noise
+    monkeypatch.setattr(s, "_is_noise", lambda *a: False)
+    assert s.judge(resting, known(1.0), 3, np.zeros(2)).fits

@@ -5,6 +5,8 @@ A few numbers a frame in arrays, so that memory grows by about 120 bytes a frame
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from uwbslam_jax.graph import map_pose, sight
@@ -40,6 +42,9 @@ class Column:
 
     def __getitem__(self, index):
         return self.values[index]
+
+    def __iter__(self) -> Iterator:
+        return iter(self.values)
 
     def __array__(self, dtype=None, copy=None) -> np.ndarray:
         return np.array(self.values, dtype)

@@ -184,6 +184,9 @@ class _GaussNewton(optx.GaussNewton):
     where the pose is right they pass through zero. And it evaluates once more after the last move.
     """
 
+    def __init__(self, still: float):
+        super().__init__(rtol=0.0, atol=still, linear_solver=lx.Normal(lx.Cholesky()))
+
     def terminate(self, fn, y, args, options, state, tags):
         move = state.descent_state.newton
         return (state.num_steps > 0) & (jnp.max(jnp.abs(move)) < self.atol), state.result
@@ -195,11 +198,9 @@ class _GaussNewton(optx.GaussNewton):
 def gauss_newton(residual, start, args, moves: int, still: float = 0.0):
     """Least squares by `moves` Gauss-Newton moves of optimistix at most; never raises, returns the last iterate. A move
     of which every coordinate is shorter than `still` is the last."""
-    solver = _GaussNewton(rtol=0.0, atol=still, linear_solver=lx.Normal(lx.Cholesky()))
-    solution = optx.least_squares(
-        residual, solver, start, args=args, max_steps=moves, throw=False, adjoint=optx.RecursiveCheckpointAdjoint()
-    )
-    return solution.value
+    adjoint = optx.RecursiveCheckpointAdjoint()
+    solver = _GaussNewton(still)
+    return optx.least_squares(residual, solver, start, args=args, max_steps=moves, throw=False, adjoint=adjoint).value
 
 
 def thinned(sweep: Sweep, most: int = _CHECKED_BEAMS) -> Sweep:

@@ -157,7 +157,7 @@ def _path(result: Result, stamp: int, known: np.ndarray) -> tuple[str, bytes]:
     rows["pose"][:, 5], rows["pose"][:, 6] = np.sin(yaw / 2), np.cos(yaw / 2)
     body = rows.tobytes()
     # numbers of eight bytes stand at multiples of eight: after the first pose's head there are four bytes of nothing
-    first = _STAMPED.fields["pose"][1] if len(known) else 0
+    first = _STAMPED.itemsize - 7 * 8 if len(known) else 0
     return "nav_msgs/msg/Path", b"".join([head, body[:first], bytes(4) if first else b"", body[first:]])
 
 
