@@ -152,12 +152,19 @@ class LivePage:
         beacons = [] if now is None else _beacons(now)
         scan, links = ([], []) if now is None else (_scan(now, self._lidar), _links(now))
         last = rows[-1][0] if rows else None
-        return {**self._picture, "duration": last or 1e-3, "track": track, "beacons": beacons, "scan": scan, "links": links}
+        return {
+            **self._picture,
+            "duration": last or 1e-3,
+            "track": track,
+            "beacons": beacons,
+            "scan": scan,
+            "links": links,
+        }
 
     def events(self) -> Iterator[Event]:
         """What has changed since the last call, one event after the other."""
         with self._lock:
-            now, status, fresh, self._fresh = self._now, self._status, self._fresh, False
+            now, fresh, self._fresh = self._now, self._fresh, False
         if now is None:
             return
         if fresh:
@@ -241,7 +248,7 @@ def _estimates(now: _Now) -> list[BeaconEstimate]:
         if slot:
             known = bool(e.active[slot])
             place = (np.asarray(e.beacons[slot], float), np.asarray(e.beacon_covs[slot], float)) if known else nowhere
-            found.append(BeaconEstimate(node, *place, now.states[slot] if slot in now.states else "waiting"))
+            found.append(BeaconEstimate(node, *place, now.states.get(slot, "waiting")))
     return found
 
 

@@ -48,7 +48,9 @@ class Publisher:
         """Takes in one step; called by the loop."""
         stamp, now = frame.stamp, time.monotonic()
         x, y, yaw = np.asarray(estimate.pose, float).tolist()
-        self._log("/pose", result_log.pose_with_covariance(stamp, x, y, yaw, np.asarray(estimate.pose_cov, float)), stamp)
+        self._log(
+            "/pose", result_log.pose_with_covariance(stamp, x, y, yaw, np.asarray(estimate.pose_cov, float)), stamp
+        )
         self._log("/tf", result_log.robot_transform(stamp, x, y, yaw), stamp)
         if now - self._told_at > BEACONS_S:
             self._told_at = now

@@ -139,7 +139,11 @@ def _tiles(result: Result, metrics: Mapping[str, Any] | None) -> str:
     if metrics is not None:
         m = {**dict.fromkeys(_FIGURES), **metrics}
         tiles += [
-            ("Robot error, RMS", page.figure(m["robot_rmse_m"], "m", 3), f"largest {page.figure(m['robot_max_m'], 'm', 3)}"),
+            (
+                "Robot error, RMS",
+                page.figure(m["robot_rmse_m"], "m", 3),
+                f"largest {page.figure(m['robot_max_m'], 'm', 3)}",
+            ),
             (
                 "Heading error, median",
                 page.figure(m["heading_deg_median"], "°", 2),
@@ -189,7 +193,9 @@ def _sections(result: Result, metrics: Mapping[str, Any] | None) -> str:
         pairs.append(page.section("Errors against the truth", page.table((), evaluation, [1])))
     pairs.append(page.section("Run", page.table((), plain, [1]) if plain else '<p class="sub">No summary.</p>'))
     counts = [(str(reason).replace("_", " "), page.text(count)) for reason, count in dropped.items()]
-    pairs.append(page.section("Dropped measurements", page.table((), counts, [1]) if counts else '<p class="sub">None.</p>'))
+    pairs.append(
+        page.section("Dropped measurements", page.table((), counts, [1]) if counts else '<p class="sub">None.</p>')
+    )
     settings = summary.get("config")
     text = settings if isinstance(settings, str) else _nested(settings or {})
     return "".join(

@@ -131,7 +131,9 @@ class Session:
             self._take(frame, estimate)
         return estimates
 
-    def go_on(self, state: State, tiles: Tiles, slots: dict[int, int], found_bias: dict[int, float], stamp: int) -> None:
+    def go_on(
+        self, state: State, tiles: Tiles, slots: dict[int, int], found_bias: dict[int, float], stamp: int
+    ) -> None:
         """Start from what an earlier run has found, at a stamp [ns], in place of start-up."""
         self.state, self.tiles, self._slots, self.found_bias = state, tiles, dict(slots), dict(found_bias)
         self.config = make_config(self.settings)
