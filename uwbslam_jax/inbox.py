@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol
 
 from uwbslam_jax.measurements import Message, ScanMessage
 
-BEHIND_S = 0.5
+BEHIND_S = 0.7
 """Once a scan has waited for so long, only the newest one is taken until the loop has caught up."""
 MOST = 4096
 """Messages that wait; more are dropped, the oldest first."""

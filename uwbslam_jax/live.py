@@ -250,6 +250,8 @@ class LiveRun:
         facts = Facts(warnings, self._dropped(), compile_s=self._clock.seconds, wall_s=wall_s)
         result = self._runner.result(facts)
         latency = np.array(self._latency_ms)
+        if len(latency) == len(result.stamps):
+            result.diagnostics["latency_ms"] = latency
         result.summary |= {
             "latency_ms_median": float(np.median(latency)) if len(latency) else None,
             "latency_ms_p99": float(np.percentile(latency, 99)) if len(latency) else None,

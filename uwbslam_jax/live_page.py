@@ -31,6 +31,8 @@ WORDS_S = 0.5
 MAP_S = 1.0
 _TRACK = 4000
 """Poses of the track that are kept; then every other one is left out."""
+_LINK_S = 1.0
+"""A link is shown for so long after its last range."""
 _EVENTS = 12
 _HINTS = {
     "waiting for motion": "Waiting for motion: beacons and frame are found once the robot drives.",
@@ -71,6 +73,7 @@ class _Now:
     status: str
     decided: bool
     events: list[tuple[int, str]]
+    links: dict[tuple[int, int], tuple[float, float | None]]
 
 
 class LivePage:
@@ -94,6 +97,7 @@ class LivePage:
         self._start: int | None = None
         self._decided_at: int | None = None
         self._lidar = (0.0, 0.0, 0.0)
+        self._links: dict[tuple[int, int], tuple[float, float | None]] = {}
         self._lock = threading.Lock()
         self._fresh = False
 
@@ -102,6 +106,7 @@ class LivePage:
         self._start = frame.stamp if self._start is None else self._start
         t = (frame.stamp - self._start) / 1e9
         before = self._now
+        self._links |= _links(t, frame, estimate, session.slots)
         if session.decided_at != self._decided_at:
             self._decided_at = session.decided_at
             self._take_track(session)
@@ -111,7 +116,8 @@ class LivePage:
         states = {slot: session.beacon_status(slot) for slot in session.slots.values() if slot}
         events = session.history.events[-_EVENTS:]
         decided = session.decided_at is not None
-        now = _Now(t, frame, estimate, session.slots, states, session.status, decided, events)
+        links = {pair: told for pair, told in self._links.items() if told[0] > t - _LINK_S}
+        now = _Now(t, frame, estimate, session.slots, states, session.status, decided, events, links)
         with self._lock:
             self._now, self._status = now, status
             self._track.append(_row(t, np.asarray(estimate.pose, float), np.asarray(estimate.pose_cov, float)))
@@ -150,7 +156,7 @@ class LivePage:
             now = self._now
         track = {name: [row[k] for row in rows] for k, name in enumerate(_COLUMNS)}
         beacons = [] if now is None else _beacons(now)
-        scan, links = ([], []) if now is None else (_scan(now, self._lidar), _links(now))
+        scan, links = ([], []) if now is None else (_scan(now, self._lidar), _shown_links(now))
         last = rows[-1][0] if rows else None
         return {
             **self._picture,
@@ -179,7 +185,7 @@ class LivePage:
         pose = dict(
             zip(_COLUMNS, _row(now.t, np.asarray(now.estimate.pose), np.asarray(now.estimate.pose_cov)), strict=True)
         )
-        shown = {"pose": pose, "scan": _scan(now, self._lidar), "links": _links(now), "beacons": _beacons(now)}
+        shown = {"pose": pose, "scan": _scan(now, self._lidar), "links": _shown_links(now), "beacons": _beacons(now)}
         yield "step", _json(shown)
 
     def words(self) -> Event:
@@ -228,16 +234,21 @@ def _scan(now: _Now, lidar: tuple[float, float, float]) -> list[list[float | Non
     return [flat[k : k + 2] for k in range(0, len(flat), 2)]
 
 
-def _links(now: _Now) -> list[list[float | None]]:
-    """Pairs of ids that ranged in this frame, with measured less predicted [m], None where the range was left out."""
-    r, e = now.frame.frame.ranges, now.estimate
-    ids = {slot: node for node, slot in now.slots.items()}
-    valid = np.flatnonzero(np.asarray(r.valid) & np.asarray(e.active)[r.i] & np.asarray(e.active)[r.j])
-    found = []
+def _links(
+    t: float, frame: StampedFrame, estimate: Estimate, slots: dict[int, int]
+) -> dict[tuple[int, int], tuple[float, float | None]]:
+    """Time and measured less predicted range [m] of each pair of ids that ranged; None where the range was left out."""
+    r, ids = frame.frame.ranges, {slot: node for node, slot in slots.items()}
+    valid = np.flatnonzero(np.asarray(r.valid) & np.asarray(estimate.active)[r.i] & np.asarray(estimate.active)[r.j])
+    found = {}
     for k in valid.tolist():
-        residual = numbers(np.asarray(e.innovation[k]), 3)[0] if e.weight[k] > 0 else None
-        found.append([ids[int(r.i[k])], ids[int(r.j[k])], residual])
+        a, b = sorted((ids[int(r.i[k])], ids[int(r.j[k])]))
+        found[a, b] = (t, float(estimate.innovation[k]) if estimate.weight[k] > 0 else None)
     return found
+
+
+def _shown_links(now: _Now) -> list[list[float | None]]:
+    return [[*pair, None if r is None else numbers(np.array(r), 3)[0]] for pair, (_, r) in sorted(now.links.items())]
 
 
 def _estimates(now: _Now) -> list[BeaconEstimate]:

@@ -28,6 +28,8 @@ _FIGURES: dict[str, tuple[str, str, int]] = {
     "compile_s": ("Compilation", "s", 2),
     "step_ms_median": ("Step time, median", "ms", 2),
     "step_ms_p95": ("Step time, 95 %", "ms", 2),
+    "latency_ms_median": ("Scan arrival to pose, median", "ms", 2),
+    "latency_ms_p99": ("Scan arrival to pose, 99 %", "ms", 2),
     "real_time_factor": ("Real-time factor", "×", 1),
     "peak_rss_mb": ("Peak memory", "MB", 0),
     "robot_rmse_m": ("Robot, RMS", "m", 3),

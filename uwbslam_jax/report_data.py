@@ -21,6 +21,7 @@ _DIAGNOSTICS: dict[str, tuple[str, str]] = {
     "match_score": ("Match score", ""),
     "score": ("Match score", ""),
     "step_ms": ("Step time", "ms"),
+    "latency_ms": ("Scan arrival to pose", "ms"),
     "hypotheses": ("Hypotheses", ""),
     "ranges_used": ("Ranges used", "a frame"),
     "searched": ("Wide searches", ""),
