@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import threading
 from collections import Counter, deque
-from typing import NamedTuple, Protocol
+from collections.abc import Callable
+from typing import NamedTuple
 
 from uwbslam_jax.measurements import Message, ScanMessage
 
@@ -28,14 +29,6 @@ class Arrival(NamedTuple):
     log_time: int
 
 
-class Recorder(Protocol):
-    """What takes messages for the recording. Must return at once."""
-
-    def record(self, arrival: Arrival, *, dropped: bool) -> None:
-        """dropped: a scan that the estimator never sees."""
-        ...
-
-
 class Inbox:
     """The queue. Any thread may put, one takes.
 
@@ -45,11 +38,13 @@ class Inbox:
       dropped: what was not handed out, by reason.
     """
 
-    def __init__(self, recorder: Recorder):
+    def __init__(self, record: Callable[[Arrival, bool], object]):
+        """record: takes each message and whether the estimator never sees it; must return at once."""
         self.dropped: Counter[str] = Counter()
-        self._recorder = recorder
+        self._record = record
         self._queue: deque[Arrival] = deque()
         self._changed = threading.Condition()
+        self._scans = 0  # of the queue
         self._last = 0
         self._behind = False
 
@@ -59,10 +54,11 @@ class Inbox:
             self._last = max(received, self._last + 1)
             arrival = Arrival(message, received, self._last)
             if not isinstance(message, ScanMessage):
-                self._recorder.record(arrival, dropped=False)
+                self._record(arrival, False)
             if len(self._queue) == MOST:
                 self._drop(self._queue.popleft(), OVERFULL)
             self._queue.append(arrival)
+            self._scans += isinstance(message, ScanMessage)
             self._changed.notify()
 
     def take(self, now: int, timeout: float) -> Arrival | None:
@@ -76,7 +72,8 @@ class Inbox:
                 return None
             arrival = self._queue.popleft()
             if isinstance(arrival.message, ScanMessage):
-                self._recorder.record(arrival, dropped=False)
+                self._scans -= 1
+                self._record(arrival, False)
             return arrival
 
     def thin(self, now: int) -> None:
@@ -85,8 +82,10 @@ class Inbox:
             self._thin(now)
 
     def _thin(self, now: int) -> None:
+        if not self._scans:
+            return
         scans = [arrival for arrival in self._queue if isinstance(arrival.message, ScanMessage)]
-        if scans and now - scans[0].received > BEHIND_S * 1e9:
+        if now - scans[0].received > BEHIND_S * 1e9:
             self._behind = True
         if self._behind and len(scans) > 1:
             newest = scans.pop()
@@ -97,4 +96,5 @@ class Inbox:
     def _drop(self, arrival: Arrival, why: str) -> None:
         self.dropped[why] += 1
         if isinstance(arrival.message, ScanMessage):
-            self._recorder.record(arrival, dropped=True)
+            self._scans -= 1
+            self._record(arrival, True)

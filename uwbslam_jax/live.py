@@ -122,7 +122,7 @@ class LiveRun:
         self._saved, self._fixed = saved, fixed
         self._locator = Locator(saved, settings) if saved is not None else None
         self._recorder = LogRecorder(recording, settings)
-        self._inbox = Inbox(self._recorder)
+        self._inbox = Inbox(self._recorder.record)
         self._recorder.tick = lambda: self._inbox.thin(host_time())
         self._clock = CompileClock()
         self._runner = Runner(settings, self._clock, online=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import dataclasses
 import signal
 import subprocess
@@ -33,7 +32,12 @@ from uwbslam_jax.rehearsal import rehearse
 from uwbslam_jax.simulate import SCENARIOS, scenario
 
 _LOOPBACK, _PUBLISH_PORT = "127.0.0.1", 8766
-_END_WITH_PARENT = 1  # PR_SET_PDEATHSIG of prctl(2)
+_EMULATE = """\
+import ctypes, sys
+from uwbslam_jax.__main__ import main
+ctypes.CDLL(None).prctl(1, 15)  # PR_SET_PDEATHSIG: ends when we do, even if we are killed
+main(sys.argv[1:])
+"""
 _TRUTH = "truth.npz"
 
 
@@ -75,14 +79,14 @@ def live(options: LiveOptions) -> None:
       DriverError: a URL, port or option that cannot be met. LogError, RunError, OSError: a file that cannot be used.
     """
     settings = _check(options)
+    devices = None if options.lidar is None else Devices(options.lidar, options.uwb)
     started = options.resume or options.localize
     saved = None if started is None else saved_state.load(started, settings)
     options.out.mkdir(parents=True, exist_ok=True)
     with contextlib.ExitStack() as ends, _until_told(options.duration) as go:
         page, publisher = _outputs(options, ends)
-        emulators = None if options.emulate is None else ends.enter_context(_emulators(options.emulate, options.out))
-        lidar, uwb = (options.lidar or "", options.uwb) if emulators is None else emulators
-        devices = Devices(lidar, uwb)
+        if devices is None:
+            devices = Devices(*ends.enter_context(_emulators(str(options.emulate), options.out)))
         print("getting ready", flush=True)
         rehearse(settings)
         recording = options.out / f"live-{datetime.now(UTC):%Y%m%d-%H%M%S}.mcap"
@@ -176,15 +180,10 @@ def _until_told(duration: float | None) -> Iterator[Callable[[], bool]]:
 def _emulators(world: str, out: Path) -> Iterator[tuple[str, tuple[str, ...]]]:
     """URLs of an emulated Hokuyo and emulated DWM1000 radios, served by a process of their own until the end."""
     devices = ["hokuyo=tcp://127.0.0.1:0", f"dwm1000=serial://{(out / 'dwm1000').absolute()}"]
-    command = [sys.executable, "-m", "uwbslam_jax", "emulate", *devices, "--world", world, "--truth", str(out / _TRUTH)]
-    # in a session of its own, or Ctrl-C would end it before the run; with us, should we be killed
+    command = [sys.executable, "-c", _EMULATE, "emulate", *devices, "--world", world, "--truth", str(out / _TRUTH)]
+    # in a session of its own, or Ctrl-C would end it before the run
     with subprocess.Popen(
-        command,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        start_new_session=True,
-        preexec_fn=lambda: ctypes.CDLL(None).prctl(_END_WITH_PARENT, signal.SIGTERM),
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
     ) as process:
         try:
             urls: dict[str, str] = {}

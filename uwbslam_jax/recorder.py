@@ -48,8 +48,8 @@ class LogRecorder:
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
 
-    def record(self, arrival: Arrival, *, dropped: bool) -> None:
-        """Takes a message to be written soon."""
+    def record(self, arrival: Arrival, dropped: bool) -> None:
+        """Takes a message to be written soon; dropped: a scan that the estimator never sees."""
         self._waiting.append((arrival, dropped))
 
     def close(self) -> None:
