@@ -25,7 +25,6 @@ from rosbags.typesys import Stores, get_typestore
 
 from uwbslam_drivers.device import DriverError
 from uwbslam_jax import ros_types, saved_state, slam
-from uwbslam_jax.column import Column
 from uwbslam_jax.config import MapSettings, Settings, make_config
 from uwbslam_jax.frames import FrameAssembler
 from uwbslam_jax.inbox import BEHIND_S, MOST, OVERFULL, OVERTAKEN, Arrival, Inbox
@@ -188,17 +187,6 @@ def test_what_was_recorded_has_the_numbers_of_what_was_used(tmp_path: Path) -> N
     for name in ("angle_min", "angle_increment", "time_increment", "range_min", "range_max"):
         assert getattr(back[1], name) == getattr(used[1], name)
     np.testing.assert_array_equal(back[1].ranges, used[1].ranges)
-
-
-def test_a_column_is_the_array_of_its_rows() -> None:
-    rows = np.random.default_rng(0).normal(size=(1000, 3))
-    column = Column(shape=(3,), dtype=float)
-    for row in rows:
-        column.append(row)
-    np.testing.assert_array_equal(np.array(column), rows)
-    np.testing.assert_array_equal(column[-1], rows[-1])
-    assert len(column) == 1000
-    np.testing.assert_array_equal(np.array(Column(rows, dtype=float)), rows)
 
 
 # The saved state ------------------------------------------------------------------------------------------------------

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from uwbslam_jax.column import Column
 from uwbslam_jax.measurements import StampedFrame
 from uwbslam_jax.slam import Estimate
 from uwbslam_jax.startup import Adopted
@@ -30,10 +29,10 @@ class History:
 
     def __init__(self) -> None:
         self.stamps: list[int] = []
-        self.poses = Column(shape=(3,), dtype=float)
-        self.covs = Column(shape=(3, 3))
+        self.poses: list[np.ndarray] = []
+        self.covs: list[np.ndarray] = []
         self.has_scan: list[bool] = []
-        self.diagnostics: dict[str, Column] = {}
+        self.diagnostics: dict[str, list[float]] = {}
         self.residuals: list[tuple[int, int, int, float]] = []
         self.tracks: list[tuple[int, int, float, float, float]] = []
         self.events: list[tuple[int, str]] = []
@@ -63,7 +62,7 @@ class History:
             "ranges_doubted": float(np.sum(used & (estimate.weight <= 0.25))),
         }
         for name, value in values.items():
-            self.diagnostics.setdefault(name, Column()).append(value)
+            self.diagnostics.setdefault(name, []).append(value)
         if frame.stamp - self._residuals_at > _RESIDUALS_EVERY_S * 1e9:
             self._residuals_at = frame.stamp
             for k in np.flatnonzero(used):
@@ -89,5 +88,5 @@ class History:
         turn = adopted.after[-1, 2] - adopted.before[-1, 2]
         c, s = np.cos(turn), np.sin(turn)
         R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-        self.poses = Column(poses, dtype=float)
-        self.covs = Column(R @ np.array(self.covs, float) @ R.T)
+        self.poses = list(poses)
+        self.covs = [R @ P @ R.T for P in self.covs]

@@ -95,7 +95,7 @@ class LivePage:
         self._track: list[tuple[float | None, ...]] = []
         self._every, self._skipped = 1, 0
         self._start: int | None = None
-        self._decided_at: int | None = None
+        self._events = 0
         self._lidar = (0.0, 0.0, 0.0)
         self._links: dict[tuple[int, int], tuple[float, float | None]] = {}
         self._lock = threading.Lock()
@@ -107,8 +107,8 @@ class LivePage:
         t = (frame.stamp - self._start) / 1e9
         before = self._now
         self._links |= _links(t, frame, estimate, session.slots)
-        if session.decided_at != self._decided_at:
-            self._decided_at = session.decided_at
+        if len(session.history.events) != self._events:
+            self._events = len(session.history.events)
             self._take_track(session)
         elif before is not None and t - before.t < STEP_S:
             return
@@ -128,7 +128,7 @@ class LivePage:
             self._map = jax.tree.map(lambda leaf: np.array(leaf, copy=True), session.state.grid), session.tiles.copy()
 
     def _take_track(self, session: Session) -> None:
-        """The frame was decided: the track so far is another."""
+        """What happened may have changed the track so far: the frame was decided, or a longer run tells it better."""
         history = session.history
         pick = np.unique(np.linspace(0, max(len(history.stamps) - 1, 0), _TRACK // 2).astype(int))
         with self._lock:
