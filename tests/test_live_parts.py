@@ -184,6 +184,8 @@ def test_what_was_recorded_has_the_numbers_of_what_was_used(tmp_path: Path) -> N
             writer.write(message)
     back = list(LogReader(tmp_path / "a.mcap"))
     assert back[0] == used[0]
+    assert isinstance(back[1], ScanMessage)
+    assert isinstance(used[1], ScanMessage)
     for name in ("angle_min", "angle_increment", "time_increment", "range_min", "range_max"):
         assert getattr(back[1], name) == getattr(used[1], name)
     np.testing.assert_array_equal(back[1].ranges, used[1].ranges)
