@@ -280,3 +280,12 @@ def test_what_a_user_can_mend_is_one_line(
     assert told.out == ""
     assert told.err.count("\n") == 1
     assert says in told.err
+
+
+def test_devices_that_are_not_there_are_told_at_the_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    url = f"tcp://127.0.0.1:{free_port()}"
+    assert main(["live", "--lidar", url, "-o", str(tmp_path), "--duration", "0.5", "--view", "off"]) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert f"nothing was measured: lidar ({url}) is closed" in told
+    assert "refused" in told

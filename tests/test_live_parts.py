@@ -302,6 +302,9 @@ def test_a_viewer_gets_the_page_and_is_told_of_the_end() -> None:
     assert "http" not in text.replace(' http-equiv="', "").replace("http://www.w3.org", "")
     with pytest.raises(urllib.error.HTTPError, match="404"):
         urllib.request.urlopen(view.url + "/../etc/passwd", timeout=10.0)
+    foreign = urllib.request.Request(view.url, headers={"Host": "evil.example:80"})
+    with pytest.raises(urllib.error.HTTPError, match="403"):
+        urllib.request.urlopen(foreign, timeout=10.0)
     threading.Timer(0.5, view.close).start()
     names = [name for name, _ in events_of(view.url, "end")]
     assert names[0] == "begin"

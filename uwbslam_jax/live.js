@@ -3,12 +3,13 @@ function restyle() { readColours(); colourMap(); for (const chart of charts) cha
 readColours();
 onTime.push(draw);
 listenToMap();
-function begin() { // all of `data` is new
+function begin(first) { // all of `data` is new; what was chosen by hand stays
+  const atEnd = first || now >= duration;
   ({ track, beacons, duration } = data);
   $("time").max = duration;
   showMap();
-  fit();
-  setTime(duration);
+  if (first || !(touched || $("follow").checked)) fit();
+  setTime(atEnd ? duration : now);
   for (const chart of charts) chart();
 }
 function connect() {
@@ -25,7 +26,7 @@ function connect() {
   told("connecting", false);
   source.onopen = () => told("connected", true);
   source.onerror = () => told("connection lost, trying again", false);
-  on("begin", (all) => { Object.assign(data, all); begin(); });
+  on("begin", (all) => { Object.assign(data, all); begin(false); });
   on("step", (step) => grow(() => {
     const end = track.t.length - 1;
     if (end < 0 || step.pose.t > track.t[end]) for (const name in step.pose) track[name].push(step.pose[name]);
@@ -42,7 +43,7 @@ function connect() {
   on("end", () => { source.close(); told("the run has ended", false); });
   $("live").onclick = () => { stop(); setTime(duration); };
 }
-begin();
+begin(true);
 if (data.live) connect();
 let width = window.innerWidth;
 window.addEventListener("resize", () => {

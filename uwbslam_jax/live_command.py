@@ -89,6 +89,8 @@ def live(options: LiveOptions) -> None:
             devices = Devices(*ends.enter_context(_emulators(str(options.emulate), options.out)))
         print("getting ready", flush=True)
         rehearse(settings)
+        if not go():
+            raise KeyboardInterrupt
         recording = options.out / f"live-{datetime.now(UTC):%Y%m%d-%H%M%S}.mcap"
         run = LiveRun(
             settings,
@@ -101,6 +103,8 @@ def live(options: LiveOptions) -> None:
         )
         print(f"recording to {recording}; Ctrl-C ends", flush=True)
         result = run.run(go)
+        if not result.summary["steps"]:
+            raise DriverError(f"nothing was measured: {'; '.join(devices.troubles())}")
     truth = options.out / _TRUTH
     known = Truth.load(truth) if options.emulate is not None and truth.exists() else None
     deliver(result, known if len(result.stamps) else None, options.out, f"UWB and LiDAR SLAM: {recording.name}")

@@ -18,6 +18,7 @@ _MOST_VIEWERS = 16
 _WAITING = 50
 """Events that a viewer may be behind."""
 _WRITE_TIMEOUT_S = 10.0
+_OWN_NAMES = ("127.0.0.1", "localhost")
 
 
 def parse_address(text: str) -> tuple[str, int]:
@@ -38,6 +39,7 @@ class LiveView:
     def __init__(self, live: LivePage, host: str, port: int):
         """Opens the port; 0 for any that is free. Raises DriverError where it cannot be opened."""
         self._page = live
+        self._loopback = host in _OWN_NAMES
         self._viewers: set[queue.Queue[Event]] = set()
         self._closing = threading.Event()
         view = self
@@ -97,7 +99,9 @@ class LiveView:
 
     def _answer(self, request: BaseHTTPRequestHandler) -> None:
         path = request.path.partition("?")[0]
-        if path == "/":
+        if self._loopback and request.headers.get("Host", "").rpartition(":")[0] not in _OWN_NAMES:
+            request.send_error(HTTPStatus.FORBIDDEN)  # a foreign name that leads here: another site's page asks
+        elif path == "/":
             body = self._page.whole().encode()
             self._head(request, "text/html; charset=utf-8", len(body))
             request.wfile.write(body)

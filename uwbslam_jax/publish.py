@@ -18,7 +18,7 @@ from uwbslam_jax.session import Session
 from uwbslam_jax.slam import Estimate
 
 BEACONS_S = 1.0
-MAP_S = 2.0
+MAP_S = 5.0
 
 
 class Publisher:
