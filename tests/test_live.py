@@ -226,7 +226,7 @@ class TestReport:
         links = browser.run("setTime(10); return linksAt(now)")
         rows = make_result().range_residuals
         expected = {}
-        for _, a, b, r in rows[(rows[:, 0] <= 10) & (rows[:, 0] > 9)]:
+        for _, a, b, r in rows[(rows[:, 0] <= 10) & (rows[:, 0] > 8.7)]:
             expected[int(a), int(b)] = r
         assert {(a, b) for a, b, _ in links} == set(expected)
         for a, b, r in links:

@@ -11,7 +11,8 @@ from uwbslam_jax.measurements import StampedFrame
 from uwbslam_jax.slam import Estimate
 from uwbslam_jax.startup import Adopted
 
-_RESIDUALS_EVERY_S = 0.5
+_RESIDUALS_EVERY_S = 1.0
+"""Of each pair one is kept this often: frames at fixed times would see the same pairs again and again, or none."""
 _TRACK_EVERY_S = 1.0
 
 
@@ -38,7 +39,8 @@ class History:
         self.events: list[tuple[int, str]] = []
         self.beacons: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         self.last_scan: tuple[int, StampedFrame, Estimate] | None = None
-        self._residuals_at = self._tracks_at = 0
+        self._residuals_at: dict[tuple[int, int], int] = {}
+        self._tracks_at = 0
 
     def add(self, frame: StampedFrame, estimate: Estimate, hypotheses: int) -> None:
         """Take in one step."""
@@ -63,10 +65,11 @@ class History:
         }
         for name, value in values.items():
             self.diagnostics.setdefault(name, []).append(value)
-        if frame.stamp - self._residuals_at > _RESIDUALS_EVERY_S * 1e9:
-            self._residuals_at = frame.stamp
-            for k in np.flatnonzero(used):
-                self.residuals.append((frame.stamp, int(r.i[k]), int(r.j[k]), float(estimate.innovation[k])))
+        for k in np.flatnonzero(used):
+            pair = int(r.i[k]), int(r.j[k])
+            if frame.stamp - self._residuals_at.get(pair, 0) > _RESIDUALS_EVERY_S * 1e9:
+                self._residuals_at[pair] = frame.stamp
+                self.residuals.append((frame.stamp, *pair, float(estimate.innovation[k])))
         if frame.stamp - self._tracks_at > _TRACK_EVERY_S * 1e9:
             self._tracks_at = frame.stamp
             for slot in np.flatnonzero(estimate.active[1:]) + 1:

@@ -171,10 +171,10 @@ function drawBeacons() {
     label(String(beacon.id), x + 12, y, css.ink);
   }
 }
-function linksAt(t) { // [node, node, residual or null where there is no line of sight] of about the last second
+function linksAt(t) { // [node, node, residual or null where there is no line of sight] of a little more than the last second
   if (data.links) return t >= duration ? data.links : [];
   const r = data.residuals, seen = new Map();
-  for (let k = lastBefore(r.t, t); k >= 0 && r.t[k] > t - 1; k--) if (!seen.has(r.pair[k])) seen.set(r.pair[k], r.v[k]);
+  for (let k = lastBefore(r.t, t); k >= 0 && r.t[k] > t - 1.3; k--) if (!seen.has(r.pair[k])) seen.set(r.pair[k], r.v[k]);
   return [...seen].map(([pair, v]) => [...r.pairs[pair], v]);
 }
 function drawLinks(k) {
