@@ -28,7 +28,7 @@ from uwbslam_jax.outputs import read_run, read_trajectory, write_trajectory
 from uwbslam_jax.report import write_report
 from uwbslam_jax.run import run_log
 
-SECONDS = 20
+SECONDS = 18
 """Of the live run: the emulated robot rests for four, and start-up decides after some ten more."""
 SECOND = 1_000_000_000
 FILES = {"trajectory.tum", "beacons.csv", "map.pgm", "map.yaml", "result.mcap", "summary.json", "report.html"}
@@ -160,7 +160,7 @@ def test_the_page_tells_of_start_up_devices_and_beacons(lived: Lived) -> None:
 
 
 def test_localising_leaves_the_map_as_it_was(lived: Lived, tmp_path: Path) -> None:
-    words = ["live", "--emulate", "workshop", "-o", str(tmp_path / "out"), "--duration", "5"]
+    words = ["live", "--emulate", "workshop", "-o", str(tmp_path / "out"), "--duration", "4"]
     assert main([*words, "--localize", str(lived.folder), "--view", "off"]) == 0
     assert (tmp_path / "out" / "map.pgm").read_bytes() == (lived.folder / "map.pgm").read_bytes()
     found, before = read_run(tmp_path / "out"), read_run(lived.folder)
@@ -174,7 +174,7 @@ def test_a_killed_run_has_its_recording_and_another_goes_on(lived: Lived, tmp_pa
     words += ["--resume", str(lived.folder), "--view", "off"]
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
         assert "recording to" in process.stdout.readline() + process.stdout.readline()
-        time.sleep(12.5)  # the state is saved every ten seconds
+        time.sleep(4.0)
         killed = time.time_ns()
         os.kill(process.pid, signal.SIGKILL)
     reader = LogReader(next(tmp_path.glob("live-*.mcap")))
@@ -184,7 +184,7 @@ def test_a_killed_run_has_its_recording_and_another_goes_on(lived: Lived, tmp_pa
     words[words.index("--resume") + 1] = str(tmp_path)
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
         assert "recording to" in process.stdout.readline() + process.stdout.readline()
-        time.sleep(4.0)
+        time.sleep(3.0)
         process.send_signal(signal.SIGINT)
         assert "arrival to pose" in process.communicate(timeout=60.0)[0]
     assert process.returncode == 0

@@ -142,7 +142,7 @@ class LiveRun:
         self._status, self._status_at = Status(), 0.0
         self._measured: dict[str, int] = {}
         self._saver: threading.Thread | None = None
-        self._saved_at = time.monotonic()
+        self._saved_at = float("-inf")  # the first time as soon as there is something to save
 
     def run(self, go: Callable[[], bool]) -> Result:
         """Runs for as long as `go` says, which is asked between two messages. Raises what a device's driver raised."""
@@ -167,7 +167,7 @@ class LiveRun:
             sys.setswitchinterval(interval)
         if self._devices.defect is not None:
             raise self._devices.defect
-        self._save()
+        self._save(wait=True)
         return self._result(time.perf_counter() - begin)
 
     def _turn(self, timeout: float) -> bool:
@@ -217,23 +217,24 @@ class LiveRun:
         troubles = self._devices.troubles()
         troubles += [f"recording: {self._recorder.failure}"] if self._recorder.failure else []
         self._status = Status(rates, dict(self._dropped()), latency, troubles)
-        if now - self._saved_at > _SAVE_S:
+        if now - self._saved_at > _SAVE_S and self._save(wait=False):
             self._saved_at = now
-            self._save(wait=False)
 
-    def _save(self, *, wait: bool = True) -> None:
-        """Writes the state, in a thread unless it is to be waited for; nothing before the frame is decided."""
+    def _save(self, *, wait: bool) -> bool:
+        """Writes the state in a thread, which may be waited for. False where there is nothing to save, before the frame
+        is decided, or the last one is still being written."""
         session = self._runner.session
         if self._saver is not None and (wait or not self._saver.is_alive()):
             self._saver.join()
             self._saver = None
         known = session.decided_at is not None or session.settings.filter.lidar_only
         if self._fixed or self._locator is not None or not known or self._saver is not None:
-            return
+            return False
         self._saver = threading.Thread(target=self._write_state, args=(saved_state.snapshot(session),), daemon=True)
         self._saver.start()
         if wait:
             self._saver.join()
+        return True
 
     def _write_state(self, saved: Saved) -> None:
         try:

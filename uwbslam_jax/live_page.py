@@ -103,7 +103,10 @@ class LivePage:
 
     def step(self, session: Session, frame: StampedFrame, estimate: Estimate, status: Status) -> None:
         """Takes in one step; called by the loop."""
-        self._start = frame.stamp if self._start is None else self._start
+        if self._start is None:
+            if not frame.frame.has_scan:
+                return  # time counts from the first scan, as in the report
+            self._start = frame.stamp
         t = (frame.stamp - self._start) / 1e9
         before = self._now
         self._links |= _links(t, frame, estimate, session.slots)
