@@ -87,8 +87,8 @@ def measure(*, quick: bool) -> Report:
 def _kiss_icp() -> Callable[[StampedFrame], float] | None:
     """Seconds that KISS-ICP takes for a frame's scan; None where it is not installed."""
     try:
-        from kiss_icp.config import KISSConfig
-        from kiss_icp.kiss_icp import KissICP
+        from kiss_icp.config import KISSConfig  # pyright: ignore[reportMissingImports]
+        from kiss_icp.kiss_icp import KissICP  # pyright: ignore[reportMissingImports]
     except ImportError:
         return None
     config: Any = KISSConfig()

@@ -38,7 +38,7 @@ def measure(*, quick: bool) -> Report:
         "that of a compiled scan, an epoch; iSAM2's that of its update."
     )
     try:
-        import gtsam
+        import gtsam  # pyright: ignore[reportMissingImports]
     except ImportError:
         return Report("Ranges alone", about + " GTSAM is not installed: left out.", metrics)
     theirs = _gtsam(gtsam, track, z, guess)

@@ -14,7 +14,7 @@ DRIVERS = Path(__file__).parents[1] / "drivers" / "uwbslam_drivers"
 FLOORS: dict[float, str] = {
     0: "__init__",
     1: "geometry measurements config ekf result layout mcap_records packing paths rays sparse_rows",
-    2: "motion ranging grid metrics settings_file frames ros_types worlds multilateration",
+    2: "motion ranging grid metrics settings_file frames ros_types worlds multilateration inbox",
     2.05: "keyframes",
     2.1: "sightings placement relative schemas result_log conditions",
     2.2: "mcap_log scenarios hypotheses",
@@ -33,9 +33,12 @@ FLOORS: dict[float, str] = {
     6.17: "revision",
     6.2: "session",
     6.3: "findings",
-    7: "run report_data",
-    8: "tuning simulate report outputs",
-    8.1: "commands",
+    7: "run report_data page",
+    8: "tuning simulate report outputs recorder live_page publish",
+    8.1: "saved_state live_view rehearsal deliver",
+    8.2: "live",
+    8.3: "live_command",
+    8.4: "commands",
     9: "__main__",
 }
 DRIVER_FLOORS: dict[float, str] = {

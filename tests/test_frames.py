@@ -238,6 +238,23 @@ def test_ranges_without_scans_make_frames_of_about_a_second():
         assert f.frame.ranges.age[f.frame.ranges.valid].min() >= -1.0 - 1e-6
 
 
+def test_ranges_make_a_frame_every_fifth_of_a_second_while_a_lidar_is_silent():
+    """No velocity predicts a turning robot for a second. Once scans come again, ranges wait for them again."""
+    make = assembler(max_ranges=32)
+    ranges = [ranged(0.05 * k, 0, 1 + k % 2, 1.0) for k in range(1, 240)]
+    scans = [scan(0.1 * k) for k in [*range(1, 20), *range(70, 100)]]
+    stream = sorted([*ranges, *scans], key=lambda m: m.stamp)
+    frames = [f for m in stream for f in make.add(m)]
+    blind = [f for f in frames if at(2.0) < f.stamp < at(6.9)]
+    assert not any(f.frame.has_scan for f in blind)
+    assert max(float(f.frame.dt) for f in blind[1:]) <= 0.3
+    assert blind[0].stamp - at(1.9) <= 2.5e9  # the first waits in vain
+    seeing = [f for f in frames if at(7.0) <= f.stamp <= at(9.9)]
+    assert all(f.frame.has_scan for f in seeing)
+    assert len(seeing) == 30
+    assert not make.dropped
+
+
 def driven(seconds: np.ndarray) -> list[OdometryMessage]:
     return [odometry(t, 0.5 * t, 0.0, 0.3 * t) for t in seconds]
 

@@ -6,9 +6,8 @@ Every key of the settings is a flag of `run` (--uwb.sigma-n 0.1); a flag goes be
 from __future__ import annotations
 
 import dataclasses
-import sys
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,13 +20,13 @@ from uwbslam_drivers.device import DriverError
 from uwbslam_drivers.emulators.command import EmulateOptions, emulate
 from uwbslam_jax import settings_file
 from uwbslam_jax.config import ConfigError, Settings
+from uwbslam_jax.deliver import accuracy, deliver, table
+from uwbslam_jax.live_command import LiveOptions, live
 from uwbslam_jax.log_summary import format_summary, inspect
 from uwbslam_jax.mcap_log import LogError, LogReader, LogWriter
 from uwbslam_jax.measurements import Message, ScanMessage, TruthMessage
-from uwbslam_jax.metrics import Truth, consistency, evaluate
-from uwbslam_jax.outputs import RunError, read_run, write_result
-from uwbslam_jax.report import write_report
-from uwbslam_jax.result import Result
+from uwbslam_jax.metrics import Truth, evaluate
+from uwbslam_jax.outputs import RunError, read_run
 from uwbslam_jax.run import run_log
 from uwbslam_jax.simulate import SCENARIOS, Scenario, scenario, settings_overrides, simulate
 
@@ -122,6 +121,9 @@ def call(name: str, words: Sequence[str]) -> None:
     if options is RunOptions:
         default = RunOptions(Path(), Path(), settings=_settings_file(words))
         default.log = default.out = tyro.MISSING  # these two have to be given all the same
+    elif options is LiveOptions:
+        default = LiveOptions(Path(), settings=_settings_file(words))
+        default.out = tyro.MISSING
     run(tyro.cli(options, args=list(words), default=default, prog=f"uwbslam {name}", description=options.__doc__))
 
 
@@ -172,7 +174,7 @@ def evaluate_run(options: EvaluateOptions) -> None:
     found = read_run(options.directory)
     beacons = dict(zip(found.beacon_ids.tolist(), found.beacons, strict=True))
     figures = evaluate(found.stamps, found.poses, beacons, _load_truth(options.truth))
-    print(_table(_accuracy(figures)))
+    print(table(accuracy(figures)))
 
 
 def inspect_log(options: InspectOptions) -> None:
@@ -188,6 +190,7 @@ _COMMANDS: dict[str, tuple[Any, Callable[[Any], None]]] = {
     "simulate": (SimulateOptions, simulate_scenario),
     "evaluate": (EvaluateOptions, evaluate_run),
     "inspect": (InspectOptions, inspect_log),
+    "live": (LiveOptions, live),
     "emulate": (EmulateOptions, emulate),
 }
 
@@ -207,59 +210,7 @@ def _run_and_write(
             bar.update(done - bar.n)
 
         result, truth = run_log(log, settings, online=online, progress=progress)
-    figures = None
-    if truth is not None:
-        beacons = {beacon.id: beacon.position for beacon in result.beacons}
-        figures = evaluate(result.stamps, result.poses, beacons, truth) | consistency(result, truth)
-    write_report(result, out / "report.html", figures, title or f"UWB and LiDAR SLAM: {log.name}")
-    result.summary |= figures or {}
-    write_result(result, out)
-    for warning in result.summary["warnings"]:
-        print(f"warning: {warning}", file=sys.stderr)
-    if result.summary["truncated"]:
-        print(f"warning: {result.summary['truncated']}", file=sys.stderr)
-    print(_table([*_accuracy(figures or {}), *_effort(result)]))
-    print(f"report: {out / 'report.html'}")
-
-
-def _accuracy(figures: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    """Figures against the truth, named, with units."""
-    named = {
-        "robot_rmse_m": ("robot, RMS", "{:.3f} m"),
-        "robot_ate_m": ("robot, ATE (aligned alone)", "{:.3f} m"),
-        "robot_max_m": ("robot, largest", "{:.3f} m"),
-        "heading_deg_median": ("heading, median", "{:.2f} deg"),
-        "heading_deg_p95": ("heading, 95 %", "{:.2f} deg"),
-        "beacon_mean_m": ("beacons, mean", "{:.3f} m"),
-        "beacon_max_m": ("beacons, largest", "{:.3f} m"),
-        "covered": ("share of the time covered", "{:.3f}"),
-        "pose_nees_ratio": ("pose, NEES / dof", "{:.2f}"),
-        "beacon_nees_ratio": ("beacons, NEES / dof", "{:.2f}"),
-    }
-    for key, (name, form) in named.items():
-        if key in figures:
-            yield name, form.format(figures[key])
-    if figures.get("beacons_missing"):
-        yield "beacons not placed", ", ".join(map(str, figures["beacons_missing"]))
-
-
-def _effort(result: Result) -> Iterator[tuple[str, str]]:
-    """What was found, and what it took."""
-    summary = result.summary
-    decided = summary["decided_at"]
-    states = [beacon.status for beacon in result.beacons]
-    yield "frame decided at", f"{decided:.1f} s" if decided is not None else f"never ({summary['status']})"
-    counts = [f"{states.count(status)} {status}" for status in dict.fromkeys(states)]
-    yield "beacons placed", f"{len(states)} of {len(summary['ids'])} ({', '.join(counts)})" if states else "none"
-    yield "recording", f"{summary['duration_s']:.1f} s, {summary['steps']} steps"
-    yield "step, median and 95 %", f"{summary['step_ms_median']:.2f} ms, {summary['step_ms_p95']:.2f} ms"
-    yield "real-time factor", f"{summary['real_time_factor']:.1f} (compilation, {summary['compile_s']:.1f} s, left out)"
-
-
-def _table(rows: Iterable[tuple[str, str]]) -> str:
-    rows = list(rows)
-    width = max(len(name) for name, _ in rows)
-    return "\n".join(f"{name:<{width}}  {value}" for name, value in rows)
+    deliver(result, truth, out, title or f"UWB and LiDAR SLAM: {log.name}")
 
 
 def _scenario(name: str, seed: int, duration: float | None) -> Scenario:

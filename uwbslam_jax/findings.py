@@ -185,7 +185,7 @@ def _summary(session: Session, facts: Facts) -> dict[str, Any]:
     ids = {slot: node for node, slot in session.slots.items()}
     stamps, step_ms = history.stamps, facts.step_ms
     duration = (stamps[-1] - stamps[0]) / 1e9 if stamps else 0.0
-    decided = None if session.decided_at is None else (session.decided_at - stamps[0]) / 1e9
+    decided = None if session.decided_at is None else max(session.decided_at - stamps[0], 0) / 1e9
     total = {name: int(np.sum(values)) for name, values in history.diagnostics.items()}
     rejected = {"not in line of sight": total.get("ranges_nlos", 0), "doubted": total.get("ranges_doubted", 0)}
     used = total.get("ranges_used", 0)

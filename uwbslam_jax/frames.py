@@ -29,6 +29,8 @@ from uwbslam_jax.measurements import (
 
 _SCANLESS_S = 1.0
 """Ranges wait this long for a scan before they make a frame of their own."""
+_BLIND_S = 0.2
+"""Once a LiDAR has fallen silent they wait only so long: no velocity predicts a turning robot for a second."""
 _WITHOUT_SCAN_S = 3.0
 """After so long without a scan the odometry makes the frames."""
 _ODOMETRY_EVERY_S = 0.08
@@ -61,6 +63,8 @@ class FrameAssembler:
         self._odometry: list[OdometryMessage] = []
         self._last: int | None = None
         self._scan_at: int | None = None
+        self._wait_s = _SCANLESS_S
+        self._sees = False  # whether any scan has come
 
     def frames(self, messages: Iterable[Message]) -> Iterator[StampedFrame]:
         """Frames of a whole stream of messages."""
@@ -95,6 +99,7 @@ class FrameAssembler:
             self.dropped["scan: no beams or no bearings"] += 1
             return []
         waiting = self._without_scan(before=scan.stamp)
+        self._wait_s, self._sees = _SCANLESS_S, True
         late = [m for m in self._ranges if m.stamp > scan.stamp]
         ready = [m for m in self._ranges if m.stamp <= scan.stamp]
         self._ranges = late
@@ -120,7 +125,7 @@ class FrameAssembler:
         self._newest_range[pair] = message.stamp
         self._ranges.append(message)
         # where there is odometry it makes the frames; one that lags is waited for, or they would lack its increment
-        patience = _ODOMETRY_LAGS_S if self._odometry else 2 * _SCANLESS_S
+        patience = _ODOMETRY_LAGS_S if self._odometry else 2 * self._wait_s
         if message.stamp - (self._last or self._ranges[0].stamp) > patience * 1e9:
             return self._without_scan(before=message.stamp)
         return []
@@ -167,14 +172,15 @@ class FrameAssembler:
         frames: list[StampedFrame] = []
         while self._ranges:
             first = self._last if self._last is not None else self._ranges[0].stamp
-            ready = [m for m in self._ranges if m.stamp - first <= _SCANLESS_S * 1e9 or m is self._ranges[0]][
+            ready = [m for m in self._ranges if m.stamp - first <= self._wait_s * 1e9 or m is self._ranges[0]][
                 : self._max_ranges
             ]
             rest = self._ranges[len(ready) :]
-            overdue = before is None or (before - first > _SCANLESS_S * 1.5e9) or len(self._ranges) > self._max_ranges
+            overdue = before is None or (before - first > self._wait_s * 1.5e9) or len(self._ranges) > self._max_ranges
             if not overdue or (before is not None and (ready[-1].stamp >= before or not rest)):
                 break
             self._ranges = rest
+            self._wait_s = _BLIND_S if self._sees else _SCANLESS_S
             frames.append(self._close(max(ready[-1].stamp, (self._last or 0) + 1), ready, None))
         return frames
 

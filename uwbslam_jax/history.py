@@ -14,7 +14,8 @@ from uwbslam_jax.measurements import StampedFrame
 from uwbslam_jax.slam import Estimate
 from uwbslam_jax.startup import Adopted, carried_along
 
-_RESIDUALS_EVERY_S = 0.5
+_RESIDUALS_EVERY_S = 1.0
+"""Of each pair one is kept this often: frames at fixed times would see the same pairs again and again, or none."""
 _TRACK_EVERY_S = 1.0
 
 
@@ -90,7 +91,8 @@ class History:
         self.tracks: list[tuple[int, int, float, float, float]] = []
         self.events: list[tuple[int, str]] = []
         self.last_scan: tuple[int, StampedFrame, Estimate] | None = None
-        self._residuals_at = self._tracks_at = 0
+        self._residuals_at: dict[tuple[int, int], int] = {}
+        self._tracks_at = 0
         self.left: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         self._seen: Estimate | None = None
 
@@ -126,10 +128,11 @@ class History:
         told = (estimate.score, estimate.known, estimate.poor, estimate.searched, estimate.drawn, hypotheses)
         counts = (np.count_nonzero(r.valid), believed, nlos, np.count_nonzero(used) - believed)
         self._diagnostics.append((*told, np.count_nonzero(active) - 1, *counts))
-        if frame.stamp - self._residuals_at > _RESIDUALS_EVERY_S * 1e9:
-            self._residuals_at = frame.stamp
-            for k in np.flatnonzero(used):
-                self.residuals.append((frame.stamp, int(r.i[k]), int(r.j[k]), float(estimate.innovation[k])))
+        for k in np.flatnonzero(used):
+            pair = int(r.i[k]), int(r.j[k])
+            if frame.stamp - self._residuals_at.get(pair, 0) > _RESIDUALS_EVERY_S * 1e9:
+                self._residuals_at[pair] = frame.stamp
+                self.residuals.append((frame.stamp, *pair, float(estimate.innovation[k])))
         if frame.stamp - self._tracks_at > _TRACK_EVERY_S * 1e9:
             self._tracks_at = frame.stamp
             for slot in np.flatnonzero(estimate.active[1:]) + 1:

@@ -176,9 +176,13 @@ class LogWriter:
         self._topics = {"scan": scan_topic, "uwb": uwb_topic, "odom": odom_topic}
         self._channels: dict[str, int] = {}
 
-    def write(self, message: Message, log_time: int | None = None) -> None:
-        """Writes one measurement; log_time [ns] is its stamp where not given. Raises LogError for an unfit stamp."""
-        topic = self._topic(message)
+    def write(self, message: Message, log_time: int | None = None, topic: str | None = None) -> None:
+        """Writes one measurement; log_time [ns] is its stamp and topic that of its kind where not given.
+
+        Raises:
+          LogError: a stamp that cannot be written.
+        """
+        topic = topic or self._topic(message)
         try:
             schema, data = encode(message)
             if topic not in self._channels:
@@ -194,7 +198,7 @@ class LogWriter:
         return self._topics[kind]
 
     def flush(self) -> None:
-        """Hands what is compressed so far to the operating system."""
+        """Hands all messages so far to the operating system."""
         self._records.flush()
 
     def close(self) -> None:

@@ -311,7 +311,7 @@ class RecordWriter:
     """Writes an MCAP file of profile ros2 in zstd chunks; a context manager that always finishes the file."""
 
     def __init__(self, path: str | Path, *, chunk_size: int = 1 << 17):
-        """Opens the file. A killed process loses at most the last `chunk_size` bytes of messages. Raises LogError."""
+        """Opens the file. A killed process loses what came after the last full chunk or `flush`. Raises LogError."""
         self.path = Path(path)
         try:
             self._file = self.path.open("wb")
@@ -334,8 +334,8 @@ class RecordWriter:
         self._sequence[channel] += 1
 
     def flush(self) -> None:
-        """Hands the finished chunks to the operating system."""
-        self._file.flush()
+        """Finishes the open chunk and hands it to the operating system."""
+        self._writer.flush()
 
     def close(self) -> None:
         """Writes the summary and closes the file; a second call does nothing."""

@@ -1,26 +1,22 @@
 """A run as one HTML page that opens offline: figures, map with a player, charts and tables.
 
-The page's looks are in report.html, its map and charts in report.js; its data comes from report_data; here its words
-and tables are written.
+The page's frame is `page`, its data comes from report_data; here its words and tables are written.
 """
 
 from __future__ import annotations
 
 import html
-import json
-import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from uwbslam_jax import __version__
+from uwbslam_jax import page
 from uwbslam_jax.report_data import diagnostics, page_data, pair_kinds, pair_residuals, span
-from uwbslam_jax.result import BeaconEstimate, Result
+from uwbslam_jax.result import Result
 
 _PAIRS = 60  # rows of the table of pairs
 
@@ -32,6 +28,8 @@ _FIGURES: dict[str, tuple[str, str, int]] = {
     "compile_s": ("Compilation", "s", 2),
     "step_ms_median": ("Step time, median", "ms", 2),
     "step_ms_p95": ("Step time, 95 %", "ms", 2),
+    "latency_ms_median": ("Scan arrival to pose, median", "ms", 2),
+    "latency_ms_p99": ("Scan arrival to pose, 99 %", "ms", 2),
     "real_time_factor": ("Real-time factor", "×", 1),
     "peak_rss_mb": ("Peak memory", "MB", 0),
     "robot_rmse_m": ("Robot, RMS", "m", 3),
@@ -67,26 +65,15 @@ def write_report(
     Raises:
       OSError: the file cannot be written.
     """
-    folder = files("uwbslam_jax")
-    parts = {
-        "title": html.escape(title),
-        "subtitle": _subtitle(result),
-        "notices": "".join(
-            f'<div class="notice {kind}">{"<b>Warning:</b> " if kind == "warn" else ""}{html.escape(text)}</div>'
-            for kind, text in _notices(result, metrics)
-        ),
-        "tiles": _tiles(result, metrics),
-        "legend": _legend(result.beacons),
-        "sections": _sections(result, metrics),
-        "footer": f"uwbslam_jax {html.escape(__version__)}",
-        # A closing tag inside a text would end the script element; the escape means the same to JSON.
-        "data": json.dumps(page_data(result), separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
-        "script": folder.joinpath("report.js").read_text(encoding="utf-8"),
-    }
-    template = folder.joinpath("report.html").read_text(encoding="utf-8")
-    # In one pass, so that a text which looks like a placeholder stays a text.
-    page = re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], template)
-    Path(path).write_text(page, encoding="utf-8")
+    parts = page.Parts(
+        title=title,
+        subtitle=_subtitle(result),
+        notices=page.notices(_notices(result, metrics)),
+        tiles=_tiles(result, metrics),
+        sections=_sections(result, metrics),
+        data=page_data(result),
+    )
+    Path(path).write_text(page.render(parts), encoding="utf-8")
 
 
 def _subtitle(result: Result) -> str:
@@ -133,15 +120,18 @@ def _notices(result: Result, metrics: Mapping[str, Any] | None) -> Iterator[tupl
     for text in summary.get("warnings") or []:
         yield "warn", str(text)
     frames = np.diff(result.stamps) / 1e6
-    p95 = summary.get("step_ms_p95")
-    if len(frames) and isinstance(p95, int | float) and p95 > np.median(frames):
-        yield "warn", f"Slower than real time: a step takes {p95:.1f} ms (95 %), a frame {np.median(frames):.1f} ms."
+    step = float(np.mean(result.diagnostics["step_ms"])) if len(result.diagnostics.get("step_ms", [])) else 0.0
+    if len(frames) and step > np.median(frames):
+        yield (
+            "warn",
+            f"Slower than real time: a step takes {step:.1f} ms in the mean, a frame {np.median(frames):.1f} ms.",
+        )
     for status in ("moving", "silent", "dropped"):
         ids = [str(beacon.id) for beacon in result.beacons if beacon.status == status]
         if ids:
             yield "info", f"{'Beacon' if len(ids) == 1 else 'Beacons'} {', '.join(ids)} {status} at the end."
     if metrics and metrics.get("beacons_missing"):
-        yield "warn", f"Not placed although the truth has them: beacons {_text(metrics['beacons_missing'])}."
+        yield "warn", f"Not placed although the truth has them: beacons {page.text(metrics['beacons_missing'])}."
 
 
 def _tiles(result: Result, metrics: Mapping[str, Any] | None) -> str:
@@ -154,58 +144,34 @@ def _tiles(result: Result, metrics: Mapping[str, Any] | None) -> str:
     if metrics is not None:
         m = {**dict.fromkeys(_FIGURES), **metrics}
         tiles += [
-            ("Robot error, RMS", _figure(m["robot_rmse_m"], "m", 3), f"largest {_figure(m['robot_max_m'], 'm', 3)}"),
+            (
+                "Robot error, RMS",
+                page.figure(m["robot_rmse_m"], "m", 3),
+                f"largest {page.figure(m['robot_max_m'], 'm', 3)}",
+            ),
             (
                 "Heading error, median",
-                _figure(m["heading_deg_median"], "°", 2),
-                f"95 % {_figure(m['heading_deg_p95'], '°', 2)}",
+                page.figure(m["heading_deg_median"], "°", 2),
+                f"95 % {page.figure(m['heading_deg_p95'], '°', 2)}",
             ),
             (
                 "Beacon error, mean",
-                _figure(m["beacon_mean_m"], "m", 3),
-                f"largest {_figure(m['beacon_max_m'], 'm', 3)}",
+                page.figure(m["beacon_mean_m"], "m", 3),
+                f"largest {page.figure(m['beacon_max_m'], 'm', 3)}",
             ),
         ]
     tiles += [
         ("Beacons placed", str(len(result.beacons)), ", ".join(f"{n} {html.escape(s)}" for s, n in states.items())),
         ("Frame decided", html.escape(at) if decided else "not decided", "after the first scan" if at != "yes" else ""),
-        ("Driven", _figure(_driven(result), "m", 1), f"in {_figure(span(result), 's', 1)}"),
+        ("Driven", page.figure(_driven(result), "m", 1), f"in {page.figure(span(result), 's', 1)}"),
         (
             "Step time, median",
-            _figure(summary["step_ms_median"], "ms", 2),
-            f"95 % {_figure(summary['step_ms_p95'], 'ms', 2)}",
+            page.figure(summary["step_ms_median"], "ms", 2),
+            f"95 % {page.figure(summary['step_ms_p95'], 'ms', 2)}",
         ),
-        ("Real-time factor", _figure(summary["real_time_factor"], "×", 1), "recorded time over computing time"),
+        ("Real-time factor", page.figure(summary["real_time_factor"], "×", 1), "recorded time over computing time"),
     ]
-    cells = "".join(
-        f'<div class="tile"><div class="name">{name}</div><div class="value">{value}</div>'
-        f'<div class="note">{note}</div></div>'
-        for name, value, note in tiles
-    )
-    return f'<div class="tiles{" five" if metrics is None else ""}">{cells}</div>'
-
-
-def _figure(value: Any, unit: str, digits: int) -> str:
-    """A number with its unit, small, as HTML; a dash where there is none."""
-    if not isinstance(value, int | float | np.number) or not np.isfinite(value):
-        return "–"
-    space = "" if unit in ("°", "×") else " "
-    return f"{value:.{digits}f}" + (f"{space}<small>{html.escape(unit)}</small>" if unit else "")
-
-
-def _text(value: Any) -> str:
-    """Any value of a summary as plain text."""
-    if isinstance(value, bool | np.bool_):
-        return "yes" if value else "no"
-    if value is None:
-        return "–"
-    if isinstance(value, float | np.floating):
-        return f"{value:.5g}" if np.isfinite(value) else "–"
-    if isinstance(value, Mapping):
-        return ", ".join(f"{key}: {_text(item)}" for key, item in value.items()) or "none"
-    if isinstance(value, list | tuple | np.ndarray):
-        return ", ".join(map(_text, value)) or "none"
-    return str(value)
+    return page.tiles(tiles)
 
 
 def _label(name: str, value: Any) -> tuple[str, str]:
@@ -215,29 +181,8 @@ def _label(name: str, value: Any) -> tuple[str, str]:
     label, unit, digits = _FIGURES.get(name, plain)
     label = label[:1].upper() + label[1:].replace("_", " ")
     if isinstance(value, int | float) and not isinstance(value, bool) and np.isfinite(value):
-        return label, f"{value:.{digits}f} {unit}".rstrip() if digits >= 0 else f"{_text(value)} {unit}".rstrip()
-    return label, _text(value)
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]], numeric: Sequence[int] = ()) -> str:
-    """A table of plain texts; the numeric columns are set to the right."""
-
-    def line(tag: str, cells: Sequence[str]) -> str:
-        kinds = [' class="n"' if k in numeric else ' class="text"' for k in range(len(cells))]
-        inner = "".join(f"<{tag}{kind}>{html.escape(cell)}</{tag}>" for kind, cell in zip(kinds, cells, strict=True))
-        return f"<tr>{inner}</tr>"
-
-    header = f"<thead>{line('th', head)}</thead>" if head else ""
-    return f'<div class="scroll"><table>{header}<tbody>{"".join(line("td", row) for row in rows)}</tbody></table></div>'
-
-
-def _section(title: str, body: str) -> str:
-    return f"<section><h2>{html.escape(title)}</h2>{body}</section>"
-
-
-def _legend(beacons: Sequence[BeaconEstimate]) -> str:
-    present = [s for s in ("static", "moving", "silent", "dropped", "relative") if any(b.status == s for b in beacons)]
-    return "".join(f'<span><i style="background: var(--{s})"></i>beacon, {s}</span>' for s in present)
+        return label, f"{value:.{digits}f} {unit}".rstrip() if digits >= 0 else f"{page.text(value)} {unit}".rstrip()
+    return label, page.text(value)
 
 
 def _sections(result: Result, metrics: Mapping[str, Any] | None) -> str:
@@ -250,20 +195,22 @@ def _sections(result: Result, metrics: Mapping[str, Any] | None) -> str:
     pairs = []
     if metrics is not None:
         evaluation = [_label(key, value) for key, value in metrics.items()]
-        pairs.append(_section("Errors against the truth", _table((), evaluation, [1])))
-    pairs.append(_section("Run", _table((), plain, [1]) if plain else '<p class="sub">No summary.</p>'))
-    counts = [(str(reason).replace("_", " "), _text(count)) for reason, count in dropped.items()]
-    pairs.append(_section("Dropped measurements", _table((), counts, [1]) if counts else '<p class="sub">None.</p>'))
+        pairs.append(page.section("Errors against the truth", page.table((), evaluation, [1])))
+    pairs.append(page.section("Run", page.table((), plain, [1]) if plain else '<p class="sub">No summary.</p>'))
+    counts = [(str(reason).replace("_", " "), page.text(count)) for reason, count in dropped.items()]
+    pairs.append(
+        page.section("Dropped measurements", page.table((), counts, [1]) if counts else '<p class="sub">None.</p>')
+    )
     settings = summary.get("config")
     text = settings if isinstance(settings, str) else _nested(settings or {})
     return "".join(
         [
-            _section("Beacons", _beacon_table(result.beacons)),
+            page.section("Beacons", page.beacon_table(result.beacons)),
             _chart_section(result),
             _residual_section(result),
-            _section(
+            page.section(
                 "Events",
-                f'<div class="tall">{_table(("Time [s]", "What happened"), events, [0])}</div>'
+                f'<div class="tall">{page.table(("Time [s]", "What happened"), events, [0])}</div>'
                 if events
                 else '<p class="sub">None.</p>',
             ),
@@ -282,23 +229,8 @@ def _nested(table: Mapping[str, Any], indent: str = "") -> str:
         if isinstance(value, Mapping) and value:
             lines += [f"{indent}[{key}]", _nested(value, indent + "  ")]
         else:
-            lines.append(f"{indent}{key} = {_text(value)}")
+            lines.append(f"{indent}{key} = {page.text(value)}")
     return "\n".join(lines)
-
-
-def _beacon_table(beacons: Sequence[BeaconEstimate]) -> str:
-    if not beacons:
-        return '<p class="sub">No beacon was placed.</p>'
-    rows = []
-    for b in sorted(beacons, key=lambda b: b.id):
-        sigma = np.sqrt(np.maximum(np.diagonal(b.cov), 0))
-        numbers = [*((v, 3) for v in b.position), *((v, 4) for v in sigma)]
-        cells = "".join(f'<td class="n">{_figure(float(v), "", digits)}</td>' for v, digits in numbers)
-        kind = re.sub(r"\W", "", b.status)
-        status = html.escape(b.status)
-        rows.append(f'<tr><td class="n">{b.id}</td>{cells}<td class="status {kind}">{status}</td></tr>')
-    head = "".join(f'<th class="n">{name}</th>' for name in ("Id", "x [m]", "y [m]", "σ x [m]", "σ y [m]"))
-    return f'<div class="scroll"><table><thead><tr>{head}<th>Status</th></tr></thead>{"".join(rows)}</table></div>'
 
 
 def _chart_section(result: Result) -> str:
@@ -310,14 +242,14 @@ def _chart_section(result: Result) -> str:
         f'<output></output></div><div data-chart="{k}"></div></div>'
         for k, s in enumerate(shown)
     )
-    return _section("Over time", f'<div class="charts">{boxes}</div>')
+    return page.section("Over time", f'<div class="charts">{boxes}</div>')
 
 
 def _residual_section(result: Result) -> str:
     """Chart of the residuals, and a table of each pair's."""
     statistics = pair_residuals(result)
     if not statistics:
-        return _section("Range residuals", '<p class="sub">No range was used.</p>')
+        return page.section("Range residuals", '<p class="sub">No range was used.</p>')
     kinds = pair_kinds(result, statistics)
     options = "".join(f'<option value="{k}">{a} – {b}</option>' for k, (a, b) in enumerate(statistics))
     rows = []
@@ -332,7 +264,7 @@ def _residual_section(result: Result) -> str:
         if len(rows) < len(statistics)
         else ""
     )
-    return _section(
+    return page.section(
         "Range residuals",
         '<div class="bar"><span class="sub">Measured minus predicted [m]</span><label class="push">Pair '
         f'<select id="pair"><option value="">all</option>{options}</select></label></div><div id="residuals"></div>'
@@ -340,7 +272,7 @@ def _residual_section(result: Result) -> str:
         '<span><i style="background: var(--second)"></i>beacon – beacon</span>'
         "<span>Outliers are drawn at the edge; spread is 1.4826 times the median absolute deviation.</span></div>"
         f'<details style="margin-top: 14px"><summary>Each pair</summary>{more}'
-        f'<div class="tall">{_table(head, rows, range(2, 7))}</div></details>',
+        f'<div class="tall">{page.table(head, rows, range(2, 7))}</div></details>',
     )
 
 

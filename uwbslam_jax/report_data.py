@@ -21,6 +21,7 @@ _DIAGNOSTICS: dict[str, tuple[str, str]] = {
     "match_score": ("Match score", ""),
     "score": ("Match score", ""),
     "step_ms": ("Step time", "ms"),
+    "latency_ms": ("Scan arrival to pose", "ms"),
     "hypotheses": ("Hypotheses", ""),
     "ranges_used": ("Ranges used", "a frame"),
     "searched": ("Wide searches", ""),
@@ -51,41 +52,42 @@ def pair_kinds(result: Result, pairs: Iterable[tuple[int, int]]) -> dict[tuple[i
     return {pair: int(pair[0] in beacons and pair[1] in beacons) for pair in pairs}
 
 
-def _numbers(values: np.ndarray, digits: int) -> list[Any]:
+def numbers(values: np.ndarray, digits: int) -> list[Any]:
     """Rounded numbers for JSON, None where not finite."""
     rounded = np.round(np.asarray(values, float), digits)
     return [None if not np.isfinite(v) else int(v) if v == int(v) else v for v in rounded.ravel().tolist()]
 
 
 def page_data(result: Result) -> dict[str, Any]:
-    """All that report.js draws."""
+    """All that the page draws of a finished run."""
     seconds = (result.stamps - result.stamps[0]) / 1e9 if len(result.stamps) else np.zeros(0)
     pick = np.unique(np.linspace(0, max(len(seconds) - 1, 0), _POSES).astype(int)) if len(seconds) else slice(0)
     poses, covs = result.poses[pick], result.online_covs[pick]
-    track = {"t": _numbers(seconds[pick], 3)}
-    track |= {name: _numbers(poses[:, k], 3) for k, name in enumerate(("x", "y", "yaw"))}
-    track |= {"xx": _numbers(covs[:, 0, 0], 6), "xy": _numbers(covs[:, 0, 1], 6), "yy": _numbers(covs[:, 1, 1], 6)}
-    picture = _picture(result.map)
+    track = {"t": numbers(seconds[pick], 3)}
+    track |= {name: numbers(poses[:, k], 3) for k, name in enumerate(("x", "y", "yaw"))}
+    track |= {"xx": numbers(covs[:, 0, 0], 6), "xy": numbers(covs[:, 0, 1], 6), "yy": numbers(covs[:, 1, 1], 6)}
+    drawn = picture(result.map)
+    spots = [result.poses[:, :2], *(b.position[None] for b in result.beacons), result.scan_points.reshape(-1, 2)]
     return {
         "duration": max(span(result), 1e-3),
-        "extent": _extent(result, picture),
+        "extent": extent(spots, drawn),
         "track": track,
         "beacons": [_beacon(b, result.beacon_tracks.get(b.id)) for b in result.beacons],
-        "scan": [_numbers(point, 3) for point in result.scan_points],
-        "map": picture,
+        "scan": [numbers(point, 3) for point in result.scan_points],
+        "map": drawn,
         "diagnostics": diagnostics(result),
         "residuals": _residuals(result),
     }
 
 
 def _beacon(beacon: BeaconEstimate, path: np.ndarray | None) -> dict[str, Any]:
-    x, y = _numbers(beacon.position, 4)
+    x, y = numbers(beacon.position, 4)
     cov = beacon.cov
     out = {"id": beacon.id, "status": beacon.status, "x": x, "y": y, "track": None}
-    out["cov"] = _numbers(np.array([cov[0, 0], cov[0, 1], cov[1, 1]]), 8)
+    out["cov"] = numbers(np.array([cov[0, 0], cov[0, 1], cov[1, 1]]), 8)
     if path is not None and len(path):
         thin = path[:: max(1, len(path) // 500)]
-        out["track"] = {name: _numbers(thin[:, k], 4) for k, name in enumerate(("t", "x", "y", "sigma"))}
+        out["track"] = {name: numbers(thin[:, k], 4) for k, name in enumerate(("t", "x", "y", "sigma"))}
     return out
 
 
@@ -104,8 +106,8 @@ def diagnostics(result: Result) -> list[dict[str, Any]]:
                 "name": label,
                 "unit": unit,
                 "steps": values.dtype.kind != "f",
-                "t": _numbers((result.stamps[pick] - result.stamps[0]) / 1e9, 3),
-                "v": _numbers(values[pick], 5),
+                "t": numbers((result.stamps[pick] - result.stamps[0]) / 1e9, 3),
+                "v": numbers(values[pick], 5),
             }
         )
     return series
@@ -134,20 +136,20 @@ def _residuals(result: Result) -> dict[str, Any]:
     bound = max(float(np.quantile(np.abs(rows[:, 3]), 0.98)) * 1.25, 0.05) if len(rows) else 1.0
     rows = rows[:: -(-len(rows) // _RESIDUALS) or 1]
     return {
-        "t": _numbers(rows[:, 0], 2),
-        "v": _numbers(rows[:, 3], 3),
+        "t": numbers(rows[:, 0], 2),
+        "v": numbers(rows[:, 3], 3),
         "pair": [number[min(a, b), max(a, b)] for a, b in rows[:, 1:3].astype(int).tolist()],
+        "pairs": [list(pair) for pair in statistics],
         "kind": list(kinds.values()),
         "bound": round(bound, 3),
     }
 
 
-def _extent(result: Result, picture: dict[str, Any] | None) -> list[float]:
-    """x0, y0, x1, y1 of all that is drawn [m]."""
-    spots = [result.poses[:, :2], *(b.position[None] for b in result.beacons), result.scan_points.reshape(-1, 2)]
-    if picture:
-        x, y = picture["origin"]
-        spots.append(np.array([[x, y], [x + picture["cols"] * picture["cell"], y + picture["rows"] * picture["cell"]]]))
+def extent(spots: list[np.ndarray], drawn: dict[str, Any] | None) -> list[float]:
+    """x0, y0, x1, y1 of all that is drawn [m]: of spots (n, 2) and the picture of the map."""
+    if drawn:
+        x, y = drawn["origin"]
+        spots = [*spots, np.array([[x, y], [x + drawn["cols"] * drawn["cell"], y + drawn["rows"] * drawn["cell"]]])]
     points = np.concatenate([np.asarray(spot, float) for spot in spots])
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
@@ -156,7 +158,7 @@ def _extent(result: Result, picture: dict[str, Any] | None) -> list[float]:
     return [float(v) for v in (*(middle - half), *(middle + half))]
 
 
-def _picture(image: MapImage) -> dict[str, Any] | None:
+def picture(image: MapImage) -> dict[str, Any] | None:
     """The observed part of the map as a PNG: grey is 255 (1 - p), never observed is transparent."""
     image = crop(image)
     odds = np.nan_to_num(image.log_odds)

@@ -1,4 +1,7 @@
-"""A Result as a ROS 2 recording for Foxglove and RViz: map, path, poses, transforms, beacons and diagnostics."""
+"""A Result as a ROS 2 recording for Foxglove and RViz: map, path, poses, transforms, beacons and diagnostics.
+
+Messages are made as their type and CDR bytes; `publish` sends the same ones.
+"""
 
 from __future__ import annotations
 
@@ -82,7 +85,7 @@ def crop(image: MapImage) -> MapImage:
 
 def _once(result: Result, start: int, known: np.ndarray) -> Iterator[_Item]:
     yield _Item(start, "/tf", lambda: _packed(_transform(start, UWB_FRAME, 0.0, 0.0, 0.0)))
-    yield _Item(start, "/map", lambda: _packed(_grid(result.map, start)))
+    yield _Item(start, "/map", lambda: occupancy(result.map, start))
     yield _Item(start, "/path", lambda: _path(result, start, known))
 
 
@@ -94,8 +97,9 @@ def _poses(result: Result, known: np.ndarray) -> Iterator[_Item]:
     for index in known:
         stamp = int(result.stamps[index])
         # /pose is what was published then, with the covariance that it had; /tf belongs to the map and the path
-        yield _Item(stamp, "/pose", partial(_pose, stamp, *result.online[index].tolist(), result.online_covs[index]))
-        yield _Item(stamp, "/tf", partial(_robot_transform, stamp, *result.poses[index].tolist()))
+        published, cov = result.online[index].tolist(), result.online_covs[index]
+        yield _Item(stamp, "/pose", partial(pose_with_covariance, stamp, *published, cov))
+        yield _Item(stamp, "/tf", partial(robot_transform, stamp, *result.poses[index].tolist()))
 
 
 def _beacons(result: Result, start: int) -> Iterator[_Item]:
@@ -110,7 +114,7 @@ def _beacons(result: Result, start: int) -> Iterator[_Item]:
         known = {number: track[past[number] - 1] for number, track in tracks if past[number]}
         if known:
             yield _Item(stamp, "/beacons", lambda s=stamp, known=known: _packed(_track_markers(s, known)))
-    yield _Item(end, "/beacons", lambda: _packed(_final_markers(end, result.beacons)))
+    yield _Item(end, "/beacons", lambda: beacon_markers(end, result.beacons))
 
 
 def _diagnostics(result: Result) -> Iterator[_Item]:
@@ -122,7 +126,7 @@ def _diagnostics(result: Result) -> Iterator[_Item]:
             yield _Item(stamp, "/diagnostics", lambda make=make: _packed(make()))
 
 
-def _pose(stamp: int, x: float, y: float, yaw: float, cov: np.ndarray) -> tuple[str, bytes]:
+def pose_with_covariance(stamp: int, x: float, y: float, yaw: float, cov: np.ndarray) -> tuple[str, bytes]:
     """PoseWithCovarianceStamped; (3, 3) over x, y, yaw goes to rows and columns 0, 1, 5 of the 6 x 6."""
     full = [0.0] * 36
     for at, value in zip(_PLANAR, cov.ravel().tolist(), strict=True):
@@ -131,7 +135,7 @@ def _pose(stamp: int, x: float, y: float, yaw: float, cov: np.ndarray) -> tuple[
     return _POSE_TYPE, _POSE.pack(_CDR, *divmod(stamp, 1_000_000_000), 4, b"map", *place, *full)
 
 
-def _robot_transform(stamp: int, x: float, y: float, yaw: float) -> tuple[str, bytes]:
+def robot_transform(stamp: int, x: float, y: float, yaw: float) -> tuple[str, bytes]:
     """TFMessage of the robot: what `_transform` says, packed."""
     place = x, y, 0.0, 0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)
     return _TF_TYPE, _TF.pack(_CDR, 1, *divmod(stamp, 1_000_000_000), 4, b"map", 10, b"base_link", *place)
@@ -161,7 +165,7 @@ def _path(result: Result, stamp: int, known: np.ndarray) -> tuple[str, bytes]:
     return "nav_msgs/msg/Path", b"".join([head, body[:first], bytes(4) if first else b"", body[first:]])
 
 
-def _grid(image: MapImage, stamp: int) -> Any:
+def occupancy(image: MapImage, stamp: int) -> tuple[str, bytes]:
     """OccupancyGrid of the observed part: -1 unknown, else the probability of being occupied in percent."""
     image = crop(image)
     percent = np.rint(100.0 / (1.0 + np.exp(-image.log_odds.astype(np.float64))))
@@ -175,7 +179,7 @@ def _grid(image: MapImage, stamp: int) -> Any:
         height=rows,
         origin=pose(float(image.origin[0]), float(image.origin[1]), 0.0),
     )
-    return build("nav_msgs/msg/OccupancyGrid", header=header(stamp, MAP_FRAME), info=info, data=data.ravel())
+    return _packed(build("nav_msgs/msg/OccupancyGrid", header=header(stamp, MAP_FRAME), info=info, data=data.ravel()))
 
 
 def _track_markers(stamp: int, known: dict[int, np.ndarray]) -> Any:
@@ -186,7 +190,7 @@ def _track_markers(stamp: int, known: dict[int, np.ndarray]) -> Any:
     return build("visualization_msgs/msg/MarkerArray", markers=markers)
 
 
-def _final_markers(stamp: int, beacons: list[BeaconEstimate]) -> Any:
+def beacon_markers(stamp: int, beacons: list[BeaconEstimate]) -> tuple[str, bytes]:
     """MarkerArray of the last estimates, with 2-sigma ellipses."""
     markers: list[Any] = []
     for beacon in beacons:
@@ -194,7 +198,7 @@ def _final_markers(stamp: int, beacons: list[BeaconEstimate]) -> Any:
         small, large = np.sqrt(np.maximum(values, 0.0))
         place = float(beacon.position[0]), float(beacon.position[1]), math.atan2(vectors[1, 1], vectors[0, 1])
         markers += _beacon(stamp, beacon.id, place, (float(large), float(small)), beacon.status)
-    return build("visualization_msgs/msg/MarkerArray", markers=markers)
+    return _packed(build("visualization_msgs/msg/MarkerArray", markers=markers))
 
 
 def _beacon(

@@ -5,6 +5,7 @@ What foreign messages say when read is `schemas`; topics and files are `mcap_log
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import struct
 from typing import Any
@@ -113,6 +114,16 @@ def encode(message: Message) -> tuple[str, bytes]:
         point = vector("Point", message.x, message.y)
         filled = build("geometry_msgs/msg/PointStamped", header=header(message.stamp, "world"), point=point)
     return filled.__msgtype__, serialize(filled)
+
+
+def recorded(message: Message) -> Message:
+    """A range or a scan as a recording gives it back: its numbers rounded to single precision."""
+    if not isinstance(message, (RangeMessage, ScanMessage)):
+        return message
+    names = [field.name for field in dataclasses.fields(message) if field.name not in ("stamp", "source", "target")]
+    values = {name: getattr(message, name) for name in names}
+    rounded = {k: np.float32(v) if np.ndim(v) else float(np.float32(v)) for k, v in values.items()}
+    return dataclasses.replace(message, **rounded)
 
 
 def _odometry(message: OdometryMessage) -> Any:

@@ -74,6 +74,10 @@ class Runner:
         self._step_ms: list[float] = []
         self._links = Links()
 
+    def know(self, slots: dict[int, int]) -> None:
+        """Nodes that have slots before they are heard: those of an earlier run."""
+        self._assembler.slots.update(slots)
+
     def add(self, message: Message) -> list[Estimate]:
         """The estimates that a message leads to; in batch mode they come in groups."""
         if isinstance(message, TruthMessage):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache, partial
 
 import jax
@@ -97,6 +97,8 @@ class Session:
       found_bias: slot -> range bias that was found beyond the configured one [m]; empty where there is none.
       found_scale: what of the ranges' biases was found to grow with the distance, beyond the configured share [m/m].
       history: what was reported so far.
+      listener: called with each frame and its estimate when stepped frame by frame, before the host has its look.
+      fixed: whether map and beacons are taken as they are: the run only localises.
     """
 
     def __init__(self, settings: Settings):
@@ -112,6 +114,8 @@ class Session:
         self.hypotheses = 0
         self.found_bias: dict[int, float] = {}
         self.found_scale = 0.0
+        self.listener: Callable[[StampedFrame, Estimate], object] | None = None
+        self.fixed = False
         self._slots: dict[int, int] = {settings.robot.id: 0}
         self._pending: list[tuple[StampedFrame, Estimate]] = []
         self._solved_at = self._solved_with = 0
@@ -138,6 +142,8 @@ class Session:
         """One frame in, its estimate out (numpy)."""
         self._learn_slots(frame)
         self.state, estimate = step_once(self.config, self.params, self.state, frame.frame)
+        if self.listener is not None:
+            self.listener(frame, estimate)
         self._take(frame, estimate)
         return estimate
 
@@ -150,6 +156,19 @@ class Session:
         for frame, estimate in zip(frames, estimates, strict=True):
             self._take(frame, estimate)
         return estimates
+
+    def go_on(
+        self, state: State, tiles: Tiles, slots: dict[int, int], found_bias: dict[int, float], stamp: int
+    ) -> None:
+        """Start from what an earlier run has found, at a stamp [ns], in place of start-up."""
+        self.state, self.tiles, self._slots, self.found_bias = state, tiles, dict(slots), dict(found_bias)
+        self.config = make_config(self.settings)
+        self.params = self._biased(make_params(self.settings, self._slots))
+        self.decided_at = stamp
+        self._looks_back = False  # the scans that the saved map was drawn from are gone
+        self.status, self.hypotheses = "decided", 1
+        for slot in np.flatnonzero(np.asarray(state.active))[1:]:
+            self._keeper.placed(int(slot), stamp)
 
     def finish(self) -> None:
         """The last look, over the frames since the one before."""

@@ -30,6 +30,24 @@ class Tiles:
         """Forget all: the map is drawn anew."""
         self._kept.clear()
 
+    def copy(self) -> Tiles:
+        """The same tiles, not changed by what happens to these."""
+        other = Tiles(self.resolution)
+        other._kept = dict(self._kept)
+        return other
+
+    def dump(self) -> tuple[np.ndarray, list[np.ndarray]]:
+        """All tiles as arrays: (n, 2) row and col, and of each layer (n, side, side), the epochs' last."""
+        layers = sorted(next(iter(self._kept.values()), {}), key=lambda k: (k == _EPOCHS, k))
+        places = np.array(list(self._kept), np.int64).reshape(-1, 2)
+        return places, [np.stack([blocks[k] for blocks in self._kept.values()]) for k in layers]
+
+    def load(self, places: np.ndarray, layers: list[np.ndarray]) -> None:
+        """Take over what `dump` gave."""
+        keys = [*range(len(layers) - 1), _EPOCHS]
+        for n, (row, col) in enumerate(places.tolist()):
+            self._kept[row, col] = {k: layer[n] for k, layer in zip(keys, layers, strict=True)}
+
     def needs_move(self, origin: np.ndarray, cells: int, robot: np.ndarray) -> bool:
         """Whether the robot (2,) [m] is too far off the middle of the window at origin (2,) [m]."""
         return bool(np.abs(self._offset(origin, cells, robot)).max() > _SLACK)

@@ -1,9 +1,9 @@
-// The report's map and charts. Reads the JSON that report.py embeds and the colours that report.html names.
+// Map, track, robot and beacons at one time of a run: of a finished one, or of one that live.js lets grow. Reads the JSON
+// that is embedded in the page (report_data.page_data) and the colours that page.css names. Angles in rad, lengths in m.
 "use strict";
-(() => {
 const data = JSON.parse(document.getElementById("data").textContent);
 const $ = (id) => document.getElementById(id);
-const { track, beacons, duration } = data;
+let { track, beacons, duration } = data;
 const clamp = (v, lo, hi) => Math.min(hi, Math.max(lo, v));
 const esc = (s) => String(s).replace(/[&<>"']/g, (c) => `&#${c.charCodeAt(0)};`);
 let css = {};
@@ -13,8 +13,8 @@ const onTime = []; // called whenever the time shown changes
 
 function readColours() {
   const style = getComputedStyle(document.documentElement);
-  for (const name of ["ink", "muted", "line", "card", "accent", "second", "free", "occupied", "unknown", "scan",
-    "static", "moving", "silent", "dropped", "relative"]) css[name] = style.getPropertyValue(`--${name}`).trim();
+  for (const name of ["ink", "muted", "line", "card", "accent", "second", "free", "occupied", "unknown", "scan", "static",
+    "moving", "silent", "dropped", "relative", "fits", "off", "far-off", "nlos"]) css[name] = style.getPropertyValue(`--${name}`).trim();
   ramp = style.getPropertyValue("--ramp").split(",").map((c) => rgb(c.trim()));
 }
 function rgb(hex) { return [1, 3, 5].map((k) => parseInt(hex.slice(k, k + 2), 16)); }
@@ -32,20 +32,41 @@ function setTime(t) {
   now = clamp(t, 0, duration);
   $("time").value = now;
   $("clock").textContent = `${now.toFixed(1)} s`;
+  showPose(lastBefore(track.t, now));
   for (const show of onTime) show();
+}
+
+function showPose(k) {
+  const turn = k < 0 || track.x[k] === null ? null : (track.yaw[k] || 0) * 180 / Math.PI;
+  const spread = turn === null || track.xx[k] === null ? null : Math.sqrt(Math.max(track.xx[k] + track.yy[k], 0));
+  $("pose").textContent = turn === null ? "no pose" : `x ${track.x[k].toFixed(3)} m, y ${track.y[k].toFixed(3)} m, heading ` +
+    `${(turn - 360 * Math.round(turn / 360)).toFixed(1)}°${spread === null ? "" : `, ± ${spread.toFixed(3)} m`}`;
 }
 
 // ---- the map: canvas in metres, y up --------------------------------------------------------------------------
 const canvas = $("map"), ctx = canvas.getContext("2d");
 const view = { x: 0, y: 0, scale: 50 }; // centre [m], pixels a metre
-const layers = { track: true, beacons: true, scan: true, grid: true };
-let tiles = null, grey = null, queued = false;
+const layers = { track: true, beacons: true, links: true, scan: true, grid: true };
+let tiles = null, grey = null, queued = false, touched = false; // touched: the view was chosen by hand
 const px = (x) => (x - view.x) * view.scale + canvas.clientWidth / 2;
 const py = (y) => (view.y - y) * view.scale + canvas.clientHeight / 2;
 function draw() {
   if (!queued) { queued = true; requestAnimationFrame(() => { queued = false; drawMap(); }); }
 }
 
+function showMap() { // data.map has changed
+  if (!data.map) { tiles = grey = null; draw(); return; }
+  const image = new Image();
+  image.onload = () => {
+    const scratch = document.createElement("canvas");
+    scratch.width = image.width; scratch.height = image.height;
+    const context = scratch.getContext("2d");
+    context.drawImage(image, 0, 0);
+    grey = context.getImageData(0, 0, image.width, image.height);
+    colourMap(); draw();
+  };
+  image.src = data.map.png;
+}
 function colourMap() { // grey level 255 (1 - p) -> the theme's colours; never observed stays transparent
   if (!grey) return;
   const image = new ImageData(new Uint8ClampedArray(grey.data), grey.width, grey.height);
@@ -62,9 +83,16 @@ function colourMap() { // grey level 255 (1 - p) -> the theme's colours; never o
 }
 
 function fit() {
+  touched = false;
+  $("follow").checked = false;
   const [x0, y0, x1, y1] = data.extent;
   view.x = (x0 + x1) / 2; view.y = (y0 + y1) / 2;
   view.scale = 0.94 * Math.min(canvas.clientWidth / (x1 - x0), canvas.clientHeight / (y1 - y0));
+  draw();
+}
+function pan(x, y) {
+  view.x += x; view.y += y;
+  touched = true; $("follow").checked = false;
   draw();
 }
 function zoom(factor, x = canvas.clientWidth / 2, y = canvas.clientHeight / 2) { // about a pixel that stays put
@@ -72,6 +100,7 @@ function zoom(factor, x = canvas.clientWidth / 2, y = canvas.clientHeight / 2) {
   view.x += dx / view.scale - dx / scale;
   view.y -= dy / view.scale - dy / scale;
   view.scale = scale;
+  touched = true;
   draw();
 }
 
@@ -142,6 +171,27 @@ function drawBeacons() {
     label(String(beacon.id), x + 12, y, css.ink);
   }
 }
+function linksAt(t) { // [node, node, residual or null where there is no line of sight] of a little more than the last second
+  if (data.links) return t >= duration ? data.links : [];
+  const r = data.residuals, seen = new Map();
+  for (let k = lastBefore(r.t, t); k >= 0 && r.t[k] > t - 1.3; k--) if (!seen.has(r.pair[k])) seen.set(r.pair[k], r.v[k]);
+  return [...seen].map(([pair, v]) => [...r.pairs[pair], v]);
+}
+function drawLinks(k) {
+  if (k < 0) return;
+  const places = new Map(beacons.map((b) => [b.id, beaconAt(b, now)]));
+  const robot = { x: track.x[k], y: track.y[k] };
+  for (const [a, b, residual] of linksAt(now)) {
+    const [p, q] = [a, b].map((node) => places.has(node) ? places.get(node) : robot);
+    if (!p || !q || p.x === null || q.x === null) continue;
+    const size = Math.abs(residual);
+    ctx.strokeStyle = residual === null ? css.nlos : size < 0.2 ? css.fits : size < 0.5 ? css.off : css["far-off"];
+    ctx.setLineDash(residual === null ? [4, 4] : []);
+    ctx.lineWidth = places.has(a) && places.has(b) ? 0.8 : 1.6; ctx.globalAlpha = 0.6;
+    ctx.beginPath(); ctx.moveTo(px(p.x), py(p.y)); ctx.lineTo(px(q.x), py(q.y)); ctx.stroke();
+  }
+  ctx.setLineDash([]); ctx.globalAlpha = 1;
+}
 function drawRobot(k) {
   if (k < 0 || track.x[k] === null) return;
   const cov = [track.xx[k], track.xy[k], track.yy[k]];
@@ -163,27 +213,29 @@ function drawMap() {
   const ratio = window.devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;
   if (canvas.width !== Math.round(width * ratio)) canvas.width = Math.round(width * ratio);
   if (canvas.height !== Math.round(height * ratio)) canvas.height = Math.round(height * ratio);
+  const k = lastBefore(track.t, now);
+  if ($("follow").checked && k >= 0 && track.x[k] !== null) { view.x = track.x[k]; view.y = track.y[k]; }
   ctx.setTransform(ratio, 0, 0, ratio, 0, 0);
   ctx.fillStyle = css.unknown; ctx.fillRect(0, 0, width, height);
-  if (tiles) {
+  if (tiles && data.map) {
     const { origin, cell, rows, cols } = data.map;
     ctx.imageSmoothingEnabled = cell * view.scale < 1.5;
     ctx.drawImage(tiles, px(origin[0]), py(origin[1] + rows * cell), cols * cell * view.scale, rows * cell * view.scale);
   }
   if (layers.grid) drawGrid(width, height);
-  const k = lastBefore(track.t, now);
   if (layers.track) drawTrack(k);
   if (layers.scan && now >= duration) {
     ctx.fillStyle = css.scan;
     for (const [x, y] of data.scan) if (x !== null && y !== null) ctx.fillRect(px(x) - 1.2, py(y) - 1.2, 2.4, 2.4);
   }
+  if (layers.links) drawLinks(k);
   if (layers.beacons) drawBeacons();
   drawRobot(k);
   drawScaleBar(width, height);
 }
 
 function showPointer(x, y) {
-  const near = beacons.map((b) => [b, beaconAt(b, now)])
+  const near = beacons.map((b) => [b, beaconAt(b, now)]) // the beacon under the pointer
     .find(([, at]) => at && at.x !== null && Math.hypot(px(at.x) - x, py(at.y) - y) < 16);
   const mx = view.x + (x - canvas.clientWidth / 2) / view.scale, my = view.y - (y - canvas.clientHeight / 2) / view.scale;
   $("where").textContent = near
@@ -203,10 +255,8 @@ function listenToMap() {
       const gap = (p) => Math.max(Math.hypot(p[0] - other[0], p[1] - other[1]), 1);
       zoom(gap(after) / gap(before), (after[0] + other[0]) / 2, (after[1] + other[1]) / 2);
     }
-    view.x -= (after[0] - before[0]) / view.scale / pointers.size;
-    view.y += (after[1] - before[1]) / view.scale / pointers.size;
     pointers.set(e.pointerId, after);
-    draw();
+    pan((before[0] - after[0]) / view.scale / pointers.size, (after[1] - before[1]) / view.scale / pointers.size);
   });
   for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, (e) => pointers.delete(e.pointerId));
   canvas.addEventListener("pointerleave", () => { $("where").textContent = ""; });
@@ -215,13 +265,15 @@ function listenToMap() {
   canvas.addEventListener("keydown", (e) => {
     const step = 60 / view.scale;
     const moves = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, step], ArrowDown: [0, -step] };
-    if (moves[e.key]) { view.x += moves[e.key][0]; view.y += moves[e.key][1]; draw(); } else if (e.key === "+") zoom(1.3);
-    else if (e.key === "-") zoom(1 / 1.3); else if (e.key === "0") fit(); else return;
+    if (moves[e.key]) pan(...moves[e.key]); else if (e.key === "+") zoom(1.3); else if (e.key === "-") zoom(1 / 1.3);
+    else if (e.key === "0") fit(); else if (e.key === "f" || e.key === "F") $("follow").click();
+    else if (e.key === " ") $("play").click(); else return;
     e.preventDefault();
   });
   $("zoom-in").onclick = () => zoom(1.4);
   $("zoom-out").onclick = () => zoom(1 / 1.4);
   $("zoom-fit").onclick = fit;
+  $("follow").onchange = draw;
   for (const name of Object.keys(layers)) $(`layer-${name}`).onchange = (e) => { layers[name] = e.target.checked; draw(); };
   $("time").addEventListener("input", (e) => { stop(); setTime(+e.target.value); });
   $("play").onclick = () => (playing ? stop() : play());
@@ -241,106 +293,3 @@ function play() { // the whole run in at most 30 s
   playing = requestAnimationFrame(tick);
 }
 
-// ---- charts: SVG over time, a click moves the run to that time --------------------------------------------------
-const pad = { left: 46, right: 10, top: 8, bottom: 20 };
-function limits(values, zero) {
-  let lo = zero ? 0 : Infinity, hi = zero ? 0 : -Infinity;
-  for (const v of values) if (v !== null) { lo = Math.min(lo, v); hi = Math.max(hi, v); }
-  if (!(hi > lo)) return Number.isFinite(lo) ? [lo - 0.5, lo + 0.5] : [0, 1];
-  return [lo < 0 || !zero ? lo - (hi - lo) * 0.05 : lo, hi + (hi - lo) * 0.05];
-}
-// Axes around a body made by (x, y) -> svg text; whole: no ticks between whole numbers.
-function frame(box, height, [lo, hi], body, name, whole = false) {
-  const width = Math.max(box.clientWidth, 200);
-  const x = (t) => pad.left + t / duration * (width - pad.left - pad.right);
-  const y = (v) => height - pad.bottom - (v - lo) / (hi - lo) * (height - pad.top - pad.bottom);
-  let axes = "";
-  const ystep = Math.max(niceStep((hi - lo) / 4), whole ? 1 : 0), digits = clamp(-Math.floor(Math.log10(ystep) + 1e-9), 0, 6);
-  for (let v = Math.ceil(lo / ystep) * ystep; v <= hi + ystep * 1e-6; v += ystep)
-    axes += `<line class="grid" x1="${pad.left}" x2="${width - pad.right}" y1="${y(v)}" y2="${y(v)}"/>` +
-      `<text x="${pad.left - 6}" y="${y(v) + 4}" text-anchor="end">${(Math.abs(v) < ystep * 1e-6 ? 0 : v).toFixed(digits)}</text>`;
-  const tstep = niceStep(duration / (width / 90));
-  for (let t = 0; t <= duration * 1.0001; t += tstep)
-    axes += `<text x="${x(t)}" y="${height - 4}" text-anchor="middle">${+t.toPrecision(6)}${t === 0 ? " s" : ""}</text>`;
-  box.innerHTML = `<svg width="${width}" height="${height}" role="img" aria-label="${esc(name)}">${axes}${body(x, y)}` +
-    `<line class="cursor" y1="${pad.top}" y2="${height - pad.bottom}"/></svg>`;
-  const cursor = box.querySelector(".cursor");
-  box.showTime = () => { cursor.setAttribute("x1", x(now)); cursor.setAttribute("x2", x(now)); };
-  box.timeAt = (e) => (e.clientX - box.getBoundingClientRect().left - pad.left) / (width - pad.left - pad.right) * duration;
-  box.showTime();
-}
-function lineChart(box, series) {
-  const { t, v, steps } = series;
-  frame(box, 130, limits(v, true), (x, y) => {
-    let d = "", pen = false, before = 0;
-    for (let k = 0; k < t.length; k++) {
-      if (v[k] === null) { pen = false; continue; }
-      const X = x(t[k]).toFixed(1), Y = y(v[k]).toFixed(1);
-      d += !pen ? `M${X} ${Y}` : steps ? `L${X} ${before}L${X} ${Y}` : `L${X} ${Y}`;
-      pen = true; before = Y;
-    }
-    return `<path class="series" d="${d}"/>`;
-  }, series.name, steps);
-}
-function residualChart(box) {
-  const r = data.residuals, chosen = $("pair").value, bound = r.bound;
-  frame(box, 240, [-bound, bound], (x, y) => {
-    const d = ["", ""];
-    for (let k = 0; k < r.t.length; k++) {
-      if (r.v[k] === null || (chosen !== "" && +chosen !== r.pair[k])) continue;
-      d[r.kind[r.pair[k]]] += `M${x(r.t[k]).toFixed(1)} ${y(clamp(r.v[k], -bound, bound)).toFixed(1)}h0`;
-    }
-    return `<path class="dots first" d="${d[0]}"/><path class="dots second" d="${d[1]}"/>`;
-  }, "Range residuals over time");
-}
-function listenToChart(box, value) {
-  const show = (e) => {
-    const t = box.timeAt(e);
-    if (value && t >= 0 && t <= duration) value(t);
-  };
-  box.addEventListener("pointermove", show);
-  box.addEventListener("click", (e) => { stop(); setTime(box.timeAt(e)); });
-  onTime.push(() => box.showTime && box.showTime());
-}
-const charts = [];
-for (const box of document.querySelectorAll("[data-chart]")) {
-  const series = data.diagnostics[+box.dataset.chart], out = box.parentElement.querySelector("output");
-  const read = (t) => {
-    const k = lastBefore(series.t, t), v = k < 0 ? null : series.v[k];
-    out.textContent = v === null ? "" : `${+v.toPrecision(4)} ${series.unit} at ${t.toFixed(1)} s`;
-  };
-  charts.push(() => lineChart(box, series));
-  listenToChart(box, read);
-}
-if ($("residuals")) {
-  charts.push(() => residualChart($("residuals")));
-  listenToChart($("residuals"), null);
-  $("pair").onchange = () => residualChart($("residuals"));
-}
-
-function restyle() { readColours(); colourMap(); for (const chart of charts) chart(); draw(); }
-readColours();
-$("time").max = duration;
-onTime.push(draw);
-listenToMap();
-if (data.map) {
-  const image = new Image();
-  image.onload = () => {
-    const scratch = document.createElement("canvas");
-    scratch.width = image.width; scratch.height = image.height;
-    const context = scratch.getContext("2d");
-    context.drawImage(image, 0, 0);
-    grey = context.getImageData(0, 0, image.width, image.height);
-    colourMap(); draw();
-  };
-  image.src = data.map.png;
-}
-fit();
-setTime(duration);
-for (const chart of charts) chart();
-let width = window.innerWidth;
-window.addEventListener("resize", () => {
-  if (window.innerWidth !== width) { width = window.innerWidth; fit(); for (const chart of charts) chart(); } else draw();
-});
-window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", restyle);
-})();
