@@ -22,7 +22,7 @@ from uwbslam_jax.steps import even_drive, steps
 CALIBRATED = (1e-3, 1e-5)
 """Standard deviation of a node's bias [m], and of what of all ranges' biases grows with the distance [m/m], when ranges
 are taken to be calibrated."""
-BIASED = (0.3, 0.1)
+BIASED = (0.3, 0.02)
 """The same once they are not."""
 _STAGES = ((1000.0, 4.0), (30.0, 2.0), (5.0, 1.0))
 """One solution after the other: whitened length of an edge's residual from which on it counts less (Geman-McClure), and
