@@ -88,6 +88,7 @@ class LivePage:
         self.title = title
         self.watched = False
         self._now: _Now | None = None
+        self._told: _Now | None = None
         self._status = Status()
         self._map: tuple[Grid, Tiles] | None = None
         self._map_at = 0.0
@@ -185,6 +186,9 @@ class LivePage:
             spots = [np.asarray(now.estimate.pose[:2], float)[None], *(b.position[None] for b in _estimates(now))]
             self._picture = {"map": drawn, "extent": extent(spots, drawn)}
             yield "map", _json(self._picture)
+        if now is self._told:
+            return
+        self._told = now
         pose = dict(
             zip(_COLUMNS, _row(now.t, np.asarray(now.estimate.pose), np.asarray(now.estimate.pose_cov)), strict=True)
         )
