@@ -16,7 +16,7 @@ from uwbslam_jax.metrics import rigid_fit
 from uwbslam_jax.session import CONTROL_EVERY, Session
 
 NODES = (10, 20, 30)
-BIAS = {10: 0.3, 20: -0.3, 30: 0.25}
+BIAS = {10: 0.6, 20: -0.5, 30: 0.5}
 """Antenna delays that nobody configured [m]."""
 LOOKS = 50
 """Two and a half rounds of the room."""
@@ -113,7 +113,7 @@ def test_biases_are_found_on_the_way_and_mend_the_state(biased) -> None:
     assert np.sqrt(np.mean(robot**2)) < 0.02
     assert beacons.max() < 0.1
     for node, bias in BIAS.items():
-        assert run.found_bias[0] + run.found_bias[run.slots[node]] == pytest.approx(bias, abs=0.1)
+        assert run.found_bias[0] + run.found_bias[run.slots[node]] == pytest.approx(bias, abs=0.15)
     # the state itself has them, not only the files
     last = np.array(run.history.poses)[-50:]
     late, _ = off(run, last, truth[-50:])

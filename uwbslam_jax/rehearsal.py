@@ -35,6 +35,7 @@ def rehearse(settings: Settings) -> None:
                 break
             if decided is not None and message.stamp - decided > _AFTER_S * 1e9:
                 break
+        runner.finish()
 
 
 def _seconds(message: Message) -> float:
