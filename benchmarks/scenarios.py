@@ -52,9 +52,7 @@ def judge(name: str, seed: int, duration: float | None) -> Seed:
 
     made = scenario(name, seed, duration)
     outcome = measure(made)
-    found = {
-        check.name: check.measure(outcome.trial if check.online else outcome.whole, made) for check in ROWS[name].checks
-    }
+    found = outcome.found(ROWS[name].checks, made)
     failed = ROWS[name].shortfalls(outcome.figures, found)
     # above a load of 1 other work has slowed the run down
     return {"seed": seed, **outcome.figures, "load": os.getloadavg()[0], "checks": found, "failed": failed}

@@ -14,6 +14,7 @@ import numpy as np
 from benchmarks.checks import NAN, Trial, rms_outside
 from benchmarks.intervals import disturbed
 from benchmarks.sharpness import occupied, own_fit, sharpness, stray, wall_distances
+from benchmarks.suite import Check
 from uwbslam_jax.conditions import Scenario
 from uwbslam_jax.measurements import Message
 from uwbslam_jax.metrics import RigidMotion, Truth, align, consistency, evaluate, wrap
@@ -43,6 +44,10 @@ class Outcome:
     trial: Trial
     whole: Trial
     figures: dict[str, Any]
+
+    def found(self, checks: Iterable[Check], scenario: Scenario) -> dict[str, float]:
+        """Figure of each check by its name."""
+        return {c.name: c.measure(self.trial if c.online else self.whole, scenario) for c in checks}
 
 
 class _Watched:

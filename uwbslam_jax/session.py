@@ -97,6 +97,8 @@ class Session:
       found_bias: slot -> range bias that was found beyond the configured one [m]; empty where there is none.
       found_scale: what of the ranges' biases was found to grow with the distance, beyond the configured share [m/m].
       history: what was reported so far.
+      graph: what the run as a whole is solved from. hindsight: its solution once the run is over, else None.
+      revisions, taken_over: how often the run so far was solved, and how often the state was corrected by it.
       listener: called with each frame and its estimate when stepped frame by frame, before the host has its look.
       fixed: whether map and beacons are taken as they are: the run only localises.
     """
@@ -125,6 +127,7 @@ class Session:
         self.hindsight: Hindsight | None = None
         self._looks_back = settings.filter.preset == "robust" and not settings.filter.lidar_only
         self._reviser = Reviser()
+        self.revisions = self.taken_over = 0
         self._places: dict[Node, np.ndarray] = {}
         self._frame_nodes: tuple[Node, Node] = ((0, 0), (0, 0))
         self._copied: tuple[Params | None, Params] = (None, self.params)
@@ -300,11 +303,13 @@ class Session:
     def _revise(self, now: int) -> None:
         """Take over what the run so far tells, where the state contradicts it; begin to ask again."""
         revision = self._reviser.look()
+        self.revisions += revision is not None
         if revision is not None and (is_news(revision, self.state, self.graph) or self._learns(revision.solution)):
             self._learn_biases(revision.solution, now)
             anchors, before = self.graph.stamps(), self.graph.poses()
             self.state = take_over(self.config, self.params, revision, self.state, self.graph)
             self.tiles = revision.tiles
+            self.taken_over += 1
             self.history.carry_along(anchors, before, self.graph.poses())
             self.history.event(now, "beacons and map corrected by the run so far")
         if self._looks_back and self._reviser.wants(len(self.graph.keyframes)):
