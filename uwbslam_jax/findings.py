@@ -116,8 +116,9 @@ def _beacons(session: Session, ids: dict[int, int]) -> list[BeaconEstimate]:
             two = slice(2 * slot, 2 * slot + 2)
             found.append(BeaconEstimate(ids[slot], mean[two], cov[two, two], status))
         elif slot in session.history.beacons:
-            position, block = session.history.beacons[slot]
             left = status if status in ("moving", "silent") else "dropped"
+            # one that was dropped is remembered where it rested last
+            position, block = told.get((slot, node[1] - 1), session.history.beacons[slot])
             found.append(BeaconEstimate(ids[slot], position.astype(float), block.astype(float), left))
     return sorted(found, key=lambda beacon: beacon.id)
 
