@@ -18,6 +18,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import CHROMIUM, DRIVER, MISSING, Browser
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 from test_report import make_result
 
 from uwbslam_jax.__main__ import main
@@ -137,9 +139,20 @@ def test_dropped_scans_are_in_the_recording_apart(lived: Lived) -> None:
     assert count == lost
 
 
+def published(log: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Stamps (T,) [ns] and poses (T, 3) on /pose: what the run said at the time, before it knew better."""
+    with log.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        found = [message for *_, message in reader.iter_decoded_messages(topics=["/pose"])]
+    stamps = [m.header.stamp.sec * SECOND + m.header.stamp.nanosec for m in found]
+    places = [m.pose.pose for m in found]
+    rows = [(p.position.x, p.position.y, 2 * np.arctan2(p.orientation.z, p.orientation.w)) for p in places]
+    return np.array(stamps), np.array(rows)
+
+
 @needs_browser
 def test_the_page_shows_the_pose_that_was_sent(lived: Lived) -> None:
-    stamps, poses = read_trajectory(lived.folder / "trajectory.tum")
+    stamps, poses = published(lived.folder / "result.mcap")
     decided = json.loads((lived.folder / "summary.json").read_text())["decided_at"]
     shown = 0
     for entry in lived.seen:

@@ -105,12 +105,22 @@ class Reviser:
             self._pool = None
 
 
-def is_news(revision: Revision, state: State, graph: Graph) -> bool:
-    """Whether a revision contradicts the state: a beacon stands elsewhere, or the map was drawn elsewhere."""
+def is_news(revision: Revision, state: State, graph: Graph, *, learnt: bool) -> bool:
+    """Whether a revision contradicts the state: a beacon stands elsewhere, or the map was drawn elsewhere.
+
+    One that ends before the robot was carried off cannot be carried on to now, and is none.
+
+    Args:
+      learnt: whether biases are known already.
+    """
     solution = revision.solution
+    if any(key.broken for key in graph.keyframes[len(revision.keyframes) :]):
+        return False
     slots, places, at = _current(solution, graph)
     if len(slots) < 2:
         return False
+    if solution.biased and not learnt:
+        return True
     mean, P = np.asarray(state.belief.mean, float), np.asarray(state.belief.cov, float)
     for slot, place, b in zip(slots, places, at, strict=True):
         two, own = slice(2 * slot, 2 * slot + 2), slice(3 + 2 * b, 5 + 2 * b)

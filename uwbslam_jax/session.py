@@ -28,7 +28,7 @@ from uwbslam_jax.measurements import Frame, StampedFrame, empty_frame
 from uwbslam_jax.packing import Packing
 from uwbslam_jax.range_means import Node, RangeMeans
 from uwbslam_jax.redraw import redraw
-from uwbslam_jax.revision import Reviser, is_news, take_over
+from uwbslam_jax.revision import Reviser, Revision, is_news, take_over
 from uwbslam_jax.sightings import MEMORY_S
 from uwbslam_jax.slam import Estimate, State
 from uwbslam_jax.smoothing import Solution
@@ -183,9 +183,10 @@ class Session:
         if self.hindsight is None:
             return
         self._learn_biases(self.hindsight.solution, int(self.history.stamps[-1]))
-        seen = self.graph.seen(self.hindsight.solution.poses)
-        robot = self.hindsight.track[-1, :2]
-        self.state = self.state._replace(grid=redraw(self.config, self.params, self.tiles, seen, robot))
+        solution = self.hindsight.solution
+        seen = self.graph.seen(solution.poses)
+        grid = redraw(self.config, self.params, self.tiles, seen, self.hindsight.track[-1, :2])
+        self._take_over(Revision(self.graph.keyframes, solution, grid, self.tiles))
 
     def _question(self) -> Question | None:
         """What to solve of the run so far."""
@@ -304,13 +305,10 @@ class Session:
         """Take over what the run so far tells, where the state contradicts it; begin to ask again."""
         revision = self._reviser.look()
         self.revisions += revision is not None
-        if revision is not None and (is_news(revision, self.state, self.graph) or self._learns(revision.solution)):
+        if revision is not None and is_news(revision, self.state, self.graph, learnt=bool(self.found_bias)):
             self._learn_biases(revision.solution, now)
-            anchors, before = self.graph.stamps(), self.graph.poses()
-            self.state = take_over(self.config, self.params, revision, self.state, self.graph)
-            self.tiles = revision.tiles
+            self._take_over(revision)
             self.taken_over += 1
-            self.history.carry_along(anchors, before, self.graph.poses())
             self.history.event(now, "beacons and map corrected by the run so far")
         if self._looks_back and self._reviser.wants(len(self.graph.keyframes)):
             question = self._question()
@@ -318,8 +316,11 @@ class Session:
                 epoch = float(self.state.map_spread.way)
                 self._reviser.begin(self.config, self.params, question, self.settings.map.resolution, epoch)
 
-    def _learns(self, solution: Solution) -> bool:
-        return solution.biased and not self.found_bias
+    def _take_over(self, revision: Revision) -> None:
+        anchors, before = self.graph.stamps(), self.graph.poses()
+        self.state = take_over(self.config, self.params, revision, self.state, self.graph)
+        self.tiles = revision.tiles
+        self.history.carry_along(anchors, before, self.graph.poses())
 
     def _learn_biases(self, solution: Solution, now: int) -> None:
         if not solution.biased:
