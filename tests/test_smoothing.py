@@ -194,7 +194,9 @@ def test_derivatives_agree_with_differences() -> None:
     keys = [replace(key, informed=np.zeros((3, 3))) for key in graph.keyframes]  # blind: the even drive counts
     graph.keyframes = keys
     places = {(slot, 0): spot for slot, spot in BEACONS.items()}
-    problem = smoothing._Problem.build(graph, places, np.array([0.0, 1.0, 0.5, 0.0, 2.0]), np.zeros(K), 0.02)
+    problem = smoothing._Problem.build(
+        graph, graph.poses(), places, np.array([0.0, 1.0, 0.5, 0.0, 2.0]), np.zeros(K), 0.02
+    )
     rng = np.random.default_rng(3)
     x = problem.start(graph.poses() + rng.normal(0, 0.05, truth.shape), places)
     x[-6:] += rng.normal(0, 0.05, 6)

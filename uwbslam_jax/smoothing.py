@@ -78,7 +78,7 @@ def solve(
       height, bias: (K,) of the slots, as configured [m]. bias_scale: share of a range that is bias [m/m].
       biased: whether biases were found before.
     """
-    problem = _Problem.build(graph, places, height, bias, bias_scale)
+    problem = _Problem.build(graph, poses, places, height, bias, bias_scale)
     if problem is None:
         return None
     x = problem.start(poses, places)
@@ -119,7 +119,7 @@ class _Problem:
     pair_numbers: np.ndarray
 
     @staticmethod
-    def build(graph: Graph, places, height, bias, bias_scale) -> _Problem | None:
+    def build(graph: Graph, poses, places, height, bias, bias_scale) -> _Problem | None:
         heard: dict[Node, int] = {}
         for mean in graph.ranges.means:
             heard[mean.node] = heard.get(mean.node, 0) + 1
@@ -145,7 +145,7 @@ class _Problem:
                 d = (middle - bias[a[0]] - bias[b[0]]) / (1 + bias_scale)
                 s = mean_sigma(0.64 * len(values), scatter, graph.ranges.sigma_n)
                 pairs.append((index[a], index[b], d, height[a[0]] - height[b[0]], s))
-        old, new, between, roots, soft = steps(graph)
+        old, new, between, roots, soft = steps(graph, poses)
         return _Problem(
             len(graph.keyframes),
             nodes,

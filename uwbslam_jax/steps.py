@@ -13,14 +13,24 @@ _LOOSE = (0.1, 0.2, 0.05, 0.1)
 """The same of a step that nothing measured, without what it may have driven in the time."""
 _LONGEST_S = 3.0
 """So long at most counts with a metre a second."""
+_ASTRAY = (1.0, 0.3)
+"""Farther off than this [m, rad] nothing is that two scans tell of a robot that is known by its ranges."""
 _UNSTEADY = (0.1, 1.0)
 """Acceleration noise that is learnt at least and at most [m/s^1.5]."""
 _FEWEST_STEPS = 20
 """So many steps tell how evenly a robot drives."""
 
 
-def steps(graph: Graph) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Steps between consecutive keyframes, which bound what nothing measured, then the matches with older ground."""
+def steps(graph: Graph, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Steps between consecutive keyframes, which bound what nothing measured, then the scans laid over older ones.
+
+    Args:
+      poses: (N, 3) about where the keyframes are. An edge far from them is left out: before the frame is decided
+        nothing tells that a robot moves along a corridor, and its scans are laid over others of the same look.
+
+    Returns:
+      old, new (E,) keyframes, between (E, 3), roots (E, 3, 3) of their information, soft (E,) whether one may be wrong.
+    """
     keys = graph.keyframes
     old, new, between, roots, soft = [], [], [], [], []
     for k in range(1, len(keys)):
@@ -38,6 +48,9 @@ def steps(graph: Graph) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray,
         roots.append(np.diag(1 / sigma))
         soft.append(False)
     for edge in graph.edges:
+        off = relative(poses[edge.old], poses[edge.new]) - edge.between
+        if np.hypot(*off[:2]) > _ASTRAY[0] or abs(wrapped(off[2])) > _ASTRAY[1]:
+            continue
         values, vectors = np.linalg.eigh(edge.information)
         old.append(edge.old)
         new.append(edge.new)
