@@ -212,7 +212,7 @@ def found_before() -> Saved:
     epochs = np.asarray(state.grid.epochs)
     epochs = np.zeros((1, *(n * TILE // config.cells for n in epochs.shape[:2]), *epochs.shape[2:]), epochs.dtype)
     tiles.load(np.array([[3, -4]]), [*layers, epochs])
-    return Saved(jax.device_get(state), tiles, {0: 0, 11: 1, 12: 2, 13: 3, 14: 4}, {1: 0.15}, 0.0)
+    return Saved(jax.device_get(state), tiles, {0: 0, 11: 1, 12: 2, 13: 3, 14: 4}, {1: 0.15})
 
 
 def test_what_is_saved_comes_back(tmp_path: Path) -> None:

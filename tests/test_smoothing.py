@@ -6,7 +6,6 @@ from collections import deque
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from uwbslam_jax import smoothing
 from uwbslam_jax.graph import Edge, Graph, Keyframe, relative
@@ -30,10 +29,10 @@ def turned(theta: float, v: np.ndarray) -> np.ndarray:
     return np.array([c * v[0] - s * v[1], s * v[0] + c * v[1]])
 
 
-def make(truth: np.ndarray, seed: int = 0, bias=None, scale: float = 0.0, sight: np.ndarray | None = None) -> Graph:
+def make(truth: np.ndarray, seed: int = 0, bias=None, sight: np.ndarray | None = None) -> Graph:
     """A graph of a track: edges to the keyframe before, and to the one a round before, ranges to every beacon.
 
-    bias: by slot [m]; scale: share of the distance [m/m]; sight: (3, 3) information of every edge.
+    bias: by slot [m]; sight: (3, 3) information of every edge.
     """
     rng = np.random.default_rng(seed)
     bias = bias or dict.fromkeys(range(K), 0.0)
@@ -55,12 +54,12 @@ def make(truth: np.ndarray, seed: int = 0, bias=None, scale: float = 0.0, sight:
                 pose = (1 - share) * truth[at] + share * truth[at + 1]
                 antenna = pose[:2] + turned(pose[2], ANTENNA)
                 ends = [turned(-p[2], antenna - p[:2]) for p in truth[[at, at + 1]]]
-                d = (1 + scale) * np.linalg.norm(antenna - spot) + bias[0] + bias[slot] + rng.normal(0, 0.05)
+                d = np.linalg.norm(antenna - spot) + bias[0] + bias[slot] + rng.normal(0, 0.05)
                 graph.ranges.means.append(Mean(at, (slot, 0), share, *ends, float(d), 0.05, False))
     for i in BEACONS:
         for j in BEACONS:
             if i < j:
-                d = (1 + scale) * np.linalg.norm(BEACONS[i] - BEACONS[j]) + bias[i] + bias[j]
+                d = np.linalg.norm(BEACONS[i] - BEACONS[j]) + bias[i] + bias[j]
                 graph.ranges.pairs[(i, 0), (j, 0)] = deque(d + rng.normal(0, SIGMA_N, 200))
     return graph
 
@@ -145,14 +144,6 @@ def test_biases_are_found_and_not_invented() -> None:
     assert not solved(make(truth, seed=5)).biased
 
 
-def test_a_bias_that_grows_with_the_distance_is_found() -> None:
-    truth = loop()
-    found = solved(make(truth, scale=0.05))
-    assert found.biased
-    assert found.bias_scale == pytest.approx(0.05, abs=0.015)
-    assert nees(found, truth) < 26.1  # chi-square of 8 degrees of freedom, 0.1 %
-
-
 def test_configured_biases_and_heights_are_taken_off() -> None:
     truth = loop()
     bias = np.array([0.05, 0.2, -0.15, 0.1, -0.2])
@@ -199,8 +190,8 @@ def test_derivatives_agree_with_differences() -> None:
     )
     rng = np.random.default_rng(3)
     x = problem.start(graph.poses() + rng.normal(0, 0.05, truth.shape), places)
-    x[-6:] += rng.normal(0, 0.05, 6)
-    stage, sigmas = (1e6, 1.0), (0.3, 0.1)  # edges not softened: their reweighting is no derivative of the residual
+    x[-5:] += rng.normal(0, 0.05, 5)
+    stage, sigmas = (1e6, 1.0), 0.3  # edges not softened: their reweighting is no derivative of the residual
     J, _ = problem._linearise(x, x[:3], sigmas, stage)
     h = 1e-6
     for column in rng.choice(len(x), 40, replace=False):

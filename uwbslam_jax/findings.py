@@ -90,8 +90,7 @@ def _biases(session: Session) -> list[str]:
     ids = {slot: node for node, slot in session.slots.items()}
     found = {ids[slot]: bias for slot, bias in session.found_bias.items()}
     told = ", ".join(f"node {node} {bias:+.2f} m" for node, bias in sorted(found.items()))
-    told += f", and {100 * session.found_scale:+.1f} % of the distance" if abs(session.found_scale) > 0.001 else ""
-    advice = "set uwb.bias and uwb.bias_scale if the radios are known"
+    advice = "set uwb.bias if the radios are known"
     return [f"ranges are biased: {told} were solved from the run; {advice}"] if found else []
 
 
@@ -215,7 +214,6 @@ def _summary(session: Session, facts: Facts) -> dict[str, Any]:
         "events": [[round((stamp - int(stamps[0])) / 1e9, 3), text] for stamp, text in history.events],
         "ranges_used": used,
         "ranges_rejected": rejected,
-        "found_bias_scale": session.found_scale,
         "found_bias": {str(ids[slot]): bias for slot, bias in sorted(session.found_bias.items())},
         "dropped": dict(sorted(facts.dropped.items())),
         "truncated": facts.truncated,

@@ -45,20 +45,19 @@ class Saved:
 
     Attributes:
       state: of the estimator, numpy; tiles: of its map.
-      slots: node id -> slot; found_bias: slot -> [m]; found_scale: see Session [m/m].
+      slots: node id -> slot; found_bias: slot -> [m].
     """
 
     state: State
     tiles: Tiles
     slots: dict[int, int]
     found_bias: dict[int, float]
-    found_scale: float
 
 
 def snapshot(session: Session) -> Saved:
     """What a session has found so far; a copy, as a step takes its state's memory over."""
     state = jax.tree.map(lambda leaf: np.array(leaf, copy=True), session.state)
-    return Saved(state, session.tiles.copy(), dict(session.slots), dict(session.found_bias), session.found_scale)
+    return Saved(state, session.tiles.copy(), dict(session.slots), dict(session.found_bias))
 
 
 def save(saved: Saved, directory: Path) -> None:
@@ -68,7 +67,6 @@ def save(saved: Saved, directory: Path) -> None:
     arrays |= {"tiles": places} | {f"layer{k}": layer for k, layer in enumerate(layers)}
     about = {"version": _VERSION, "resolution": saved.tiles.resolution}
     about |= {"slots": list(saved.slots.items()), "found_bias": list(saved.found_bias.items())}
-    about |= {"found_scale": saved.found_scale}
     part = directory / f"{FILE}.part"
     with part.open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, about=np.array(json.dumps(about)), **arrays)
@@ -100,7 +98,7 @@ def load(directory: Path, settings: Settings) -> Saved:
         state = jax.tree.unflatten(jax.tree.structure(like), leaves)
         slots = {int(node): int(slot) for node, slot in about["slots"]}
         found_bias = {int(slot): float(bias) for slot, bias in about["found_bias"]}
-        return Saved(state, tiles, slots, found_bias, float(about["found_scale"]))
+        return Saved(state, tiles, slots, found_bias)
     except OSError as error:
         raise RunError(f"{path}: {error.strerror or error}") from None
     except (KeyError, ValueError, zipfile.BadZipFile, EOFError) as error:
@@ -120,8 +118,7 @@ class Locator:
         self._slots, self._bias = saved.slots, np.array(params.bias, float)
         for slot, bias in saved.found_bias.items():
             self._bias[slot] += bias
-        self._height = np.asarray(params.height, float)
-        self._scale = (1 + float(params.bias_scale)) * (1 + saved.found_scale) - 1
+        self._height, self._scale = np.asarray(params.height, float), float(params.bias_scale)
         self._places = np.asarray(saved.state.belief.mean, float)[: 2 * len(self._bias)].reshape(-1, 2)
         self._known = np.asarray(saved.state.active) & ~np.asarray(saved.state.moving)
         self._heard: list[tuple[int, int, float]] = []
@@ -162,7 +159,6 @@ def go_on(session: Session, saved: Saved, place: np.ndarray, stamp: int, *, fixe
     if fixed:
         state = _pinned(state)
     session.fixed = fixed
-    session.found_scale = saved.found_scale
     session.go_on(state, saved.tiles.copy(), saved.slots, saved.found_bias, stamp)
     session.history.event(stamp, "localising in a saved map" if fixed else "going on from a saved run")
 

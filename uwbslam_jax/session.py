@@ -95,7 +95,6 @@ class Session:
       decided_at: stamp of the frame at which the published frame was decided, None before [ns].
       status: of the start-up, in words.
       found_bias: slot -> range bias that was found beyond the configured one [m]; empty where there is none.
-      found_scale: what of the ranges' biases was found to grow with the distance, beyond the configured share [m/m].
       history: what was reported so far.
       graph: what the run as a whole is solved from. hindsight: its solution once the run is over, else None.
       revisions, taken_over: how often the run so far was solved, and how often the state was corrected by it.
@@ -115,7 +114,6 @@ class Session:
         self.status = "LiDAR only" if settings.filter.lidar_only else "waiting for motion"
         self.hypotheses = 0
         self.found_bias: dict[int, float] = {}
-        self.found_scale = 0.0
         self.listener: Callable[[StampedFrame, Estimate], object] | None = None
         self.fixed = False
         self._slots: dict[int, int] = {settings.robot.id: 0}
@@ -212,8 +210,7 @@ class Session:
         bias = np.array(params.bias)
         for slot, found in self.found_bias.items():
             bias[slot] += found
-        scale = (1.0 + params.bias_scale) * (1.0 + self.found_scale) - 1.0
-        return params._replace(bias=jnp.asarray(bias, jnp.float32), bias_scale=jnp.asarray(scale, jnp.float32))
+        return params._replace(bias=jnp.asarray(bias, jnp.float32))
 
     def _new_buffer(self) -> Buffer:
         p = self.params
@@ -327,7 +324,7 @@ class Session:
             return
         if not self.found_bias:
             self.history.event(now, "ranges are biased: biases and beacons solved from the run so far")
-        self.found_bias, self.found_scale = solution.bias, solution.bias_scale
+        self.found_bias = solution.bias
         self.params = self._biased(make_params(self.settings, self._slots))
 
     def beacon_status(self, slot: int) -> str:

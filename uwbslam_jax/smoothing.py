@@ -19,11 +19,10 @@ from uwbslam_jax.range_means import Node
 from uwbslam_jax.sparse_rows import Rows, factor
 from uwbslam_jax.steps import even_drive, steps
 
-CALIBRATED = (1e-3, 1e-5)
-"""Standard deviation of a node's bias [m], and of what of all ranges' biases grows with the distance [m/m], when ranges
-are taken to be calibrated."""
-BIASED = (0.3, 0.02)
-"""The same once they are not."""
+CALIBRATED_M = 1e-3
+"""Standard deviation of a node's bias when ranges are taken to be calibrated [m]."""
+BIASED_M = 0.3
+"""The same once they are not [m]."""
 _STAGES = ((1000.0, 4.0), (30.0, 2.0), (5.0, 1.0))
 """One solution after the other: whitened length of an edge's residual from which on it counts less (Geman-McClure), and
 how many times as much a range may err. The filter's track may be far off for what two scans tell, and nothing must be
@@ -33,8 +32,6 @@ _FEWEST_MEANS = 6
 _MOVES = 25
 _ENOUGH = 0.05
 
-Sigmas = tuple[float, float]
-
 
 class Solution(NamedTuple):
     """What the whole run tells.
@@ -42,8 +39,7 @@ class Solution(NamedTuple):
     Attributes:
       poses: (N, 3) of the keyframes [m, m, rad].
       nodes: resting places of the beacons; beacons: (B, 2) where they are [m].
-      bias: node slot -> bias beyond the configured one [m]; bias_scale: what grows with the distance beyond the
-        configured share [m/m]; about 0 where ranges are calibrated.
+      bias, bias_sigma: node slot -> bias beyond the configured one [m], about 0 where ranges are calibrated.
       biased: whether it has biases: they explain the ranges far better than none.
       cost: negative log-likelihood.
       cov: (3 + 2 B, 3 + 2 B) of the last pose and the beacons while the first pose is held.
@@ -54,7 +50,6 @@ class Solution(NamedTuple):
     beacons: np.ndarray
     bias: dict[int, float]
     bias_sigma: dict[int, float]
-    bias_scale: float
     biased: bool
     cost: float
     cov: np.ndarray
@@ -82,10 +77,10 @@ def solve(
     if problem is None:
         return None
     x = problem.start(poses, places)
-    calibrated = problem.minimise(x, CALIBRATED)
-    freed = problem.minimise(calibrated[0], BIASED)
-    biased = biased or calibrated[1] - freed[1] > DECIDED + 3.0 * (len(problem.slots) + 1)
-    return problem.solution(*(freed if biased else calibrated), BIASED if biased else CALIBRATED, biased)
+    calibrated = problem.minimise(x, CALIBRATED_M)
+    freed = problem.minimise(calibrated[0], BIASED_M)
+    biased = biased or calibrated[1] - freed[1] > DECIDED + 3.0 * len(problem.slots)
+    return problem.solution(*(freed if biased else calibrated), BIASED_M if biased else CALIBRATED_M, biased)
 
 
 @dataclass(frozen=True)
@@ -170,8 +165,8 @@ class _Problem:
 
     @property
     def size(self) -> int:
-        """Unknowns: poses, places, a bias of each slot, the bias that grows with the distance."""
-        return self._first_bias + len(self.slots) + 1
+        """Unknowns: poses, places, a bias of each slot."""
+        return self._first_bias + len(self.slots)
 
     @property
     def _first_bias(self) -> int:
@@ -179,19 +174,19 @@ class _Problem:
 
     def start(self, poses, places) -> np.ndarray:
         beacons = np.array([places[node] for node in self.nodes])
-        return np.concatenate([poses.ravel(), beacons.ravel(), np.zeros(len(self.slots) + 1)])
+        return np.concatenate([poses.ravel(), beacons.ravel(), np.zeros(len(self.slots))])
 
     def _bias_column(self, nodes: np.ndarray) -> np.ndarray:
         slots = np.array([self.slots.index(slot) for slot, _ in self.nodes])
         return self._first_bias + slots[nodes]
 
-    def minimise(self, x: np.ndarray, bias_sigma: Sigmas) -> tuple[np.ndarray, float]:
+    def minimise(self, x: np.ndarray, bias_sigma: float) -> tuple[np.ndarray, float]:
         """Levenberg-Marquardt from x: unknowns and cost."""
         for stage in _STAGES:
             x, cost = self._descend(x, bias_sigma, stage)
         return x, cost
 
-    def _descend(self, x: np.ndarray, bias_sigma: Sigmas, stage: tuple[float, float]) -> tuple[np.ndarray, float]:
+    def _descend(self, x: np.ndarray, bias_sigma: float, stage: tuple[float, float]) -> tuple[np.ndarray, float]:
         held = x[:3].copy()
         J, r = self._linearise(x, held, bias_sigma, stage)
         cost, damping = 0.5 * r @ r, 1e-6
@@ -212,7 +207,7 @@ class _Problem:
                     break
         return x, float(cost)
 
-    def solution(self, x: np.ndarray, cost: float, bias_sigma: Sigmas, biased: bool) -> Solution:
+    def solution(self, x: np.ndarray, cost: float, bias_sigma: float, biased: bool) -> Solution:
         n, m = 3 * self.count, self._first_bias
         J, _ = self._linearise(x, x[:3], bias_sigma, _STAGES[-1])
         columns = np.arange(n - 3, self.size)
@@ -225,9 +220,8 @@ class _Problem:
             x[:n].reshape(-1, 3),
             self.nodes,
             x[n:m].reshape(-1, 2),
-            dict(zip(self.slots, map(float, x[m:-1]), strict=True)),
-            dict(zip(self.slots, map(float, spread[:-1]), strict=True)),
-            float(x[-1]),
+            dict(zip(self.slots, map(float, x[m:]), strict=True)),
+            dict(zip(self.slots, map(float, spread), strict=True)),
             biased,
             cost,
             cov[: m - n + 3, : m - n + 3],
@@ -242,9 +236,8 @@ class _Problem:
         self._steady_rows(rows, poses)
         self._range_rows(rows, x, poses, stage[1])
         self._pair_rows(rows, x, stage[1])
-        sigma = np.append(np.full(len(self.slots), bias_sigma[0]), bias_sigma[1])
         m = self._first_bias
-        rows.add(x[m:] / sigma, [(np.arange(m, self.size), 1 / sigma)])
+        rows.add(x[m:] / bias_sigma, [(np.arange(m, self.size), np.full(len(self.slots), 1 / bias_sigma))])
         return rows.matrix(), rows.residuals()
 
     def _edge_rows(self, rows: Rows, poses, soft: float) -> None:
@@ -299,18 +292,18 @@ class _Problem:
         u = antenna - beacons[self.to]
         d = np.maximum(np.sqrt((u**2).sum(1) + self.rise**2), 1e-6)
         column = self._bias_column(self.to)
-        robot, grown = self._first_bias, 1.0 + x[-1]
+        robot = self._first_bias
         sigma = coarse * self.sigma
-        r, scale = soften((grown * d + x[robot] + x[column] - self.distance) / sigma)
+        r, scale = soften((d + x[robot] + x[column] - self.distance) / sigma)
         weight = scale / sigma
-        unit = grown * u / d[:, None]
+        unit = u / d[:, None]
         parts = []
         for key, end, part in ((self.at, ends[0], 1 - self.share), (self.at + 1, ends[1], self.share)):
             lever = end - poses[key, :2]
             parts += [(3 * key + axis, part * weight * unit[:, axis]) for axis in range(2)]
             parts.append((3 * key + 2, part * weight * (unit[:, 1] * lever[:, 0] - unit[:, 0] * lever[:, 1])))
         parts += [(n + 2 * self.to + axis, -weight * unit[:, axis]) for axis in range(2)]
-        parts += [(np.full(len(d), robot), weight), (column, weight), (np.full(len(d), self.size - 1), weight * d)]
+        parts += [(np.full(len(d), robot), weight), (column, weight)]
         rows.add(r, parts)
 
     def _pair_rows(self, rows: Rows, x, coarse: float) -> None:
@@ -324,11 +317,10 @@ class _Problem:
         u = beacons[i] - beacons[j]
         d = np.maximum(np.sqrt((u**2).sum(1) + rise**2), 1e-6)
         first, second = self._bias_column(i), self._bias_column(j)
-        grown = 1.0 + x[-1]
-        r, scale = soften((grown * d + x[first] + x[second] - distance) / sigma)
+        r, scale = soften((d + x[first] + x[second] - distance) / sigma)
         weight = scale / sigma
         parts = []
         for axis in range(2):
-            pull = weight * grown * u[:, axis] / d
+            pull = weight * u[:, axis] / d
             parts += [(n + 2 * i + axis, pull), (n + 2 * j + axis, -pull)]
-        rows.add(r, [*parts, (first, weight), (second, weight), (np.full(len(d), self.size - 1), weight * d)])
+        rows.add(r, [*parts, (first, weight), (second, weight)])
