@@ -45,6 +45,8 @@ _BELIEVED = (0.6, 0.6, 0.2)
 """A scan that lies farther off than this from where the map has it was laid over something else [m, m, rad]."""
 _HANG_TOGETHER = 8
 """So many keyframes whose scans lie over each other are a place."""
+_FOUND_S = 5.0
+"""A robot that was carried is found within so long."""
 _MM = 1000.0
 """Scans are kept in whole millimetres."""
 
@@ -150,8 +152,17 @@ class Graph:
         """A beacon is, or the robot (slot 0) was, somewhere else from now on."""
         if slot == 0:
             self._broken = True
+            self._doubt_last()
         else:
             self.ranges.moved(slot)
+
+    def _doubt_last(self) -> None:
+        """The robot was carried: its scans since one did not lie over the one before are not believed."""
+        tied = {edge.new for edge in self.edges if edge.old == edge.new - 1}
+        since = self.keyframes[-1].stamp - _FOUND_S * 1e9 if self.keyframes else 0
+        loose = [k for k, key in enumerate(self.keyframes) if k > 0 and key.stamp > since and k not in tied]
+        if loose:
+            self.edges = [edge for edge in self.edges if edge.new < loose[0]]
 
     def put(self, poses: np.ndarray, turn: float) -> None:
         """The map was drawn again: keyframes so far are at poses (N, 3) in it, turned by an angle [rad]."""
