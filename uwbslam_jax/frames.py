@@ -8,7 +8,7 @@ gives every node id a slot, checks stamps and counts what it drops.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator
 
 import numpy as np
@@ -30,7 +30,11 @@ from uwbslam_jax.measurements import (
 _SCANLESS_S = 1.0
 """Ranges wait this long for a scan before they make a frame of their own."""
 _BLIND_S = 0.2
-"""Once a LiDAR has fallen silent they wait only so long: no velocity predicts a turning robot for a second."""
+_BLIND_SCANS = 3
+"""Once a LiDAR has fallen silent they wait only so long, or so many of its usual intervals where those are longer: no
+velocity predicts a turning robot for a second, but a slow scanner is not a silent one."""
+_INTERVALS = 9
+"""So many intervals between scans tell the usual one."""
 _WITHOUT_SCAN_S = 3.0
 """After so long without a scan the odometry makes the frames."""
 _ODOMETRY_EVERY_S = 0.08
@@ -64,7 +68,7 @@ class FrameAssembler:
         self._last: int | None = None
         self._scan_at: int | None = None
         self._wait_s = _SCANLESS_S
-        self._sees = False  # whether any scan has come
+        self._intervals: deque[int] = deque(maxlen=_INTERVALS)  # between scans [ns]
 
     def frames(self, messages: Iterable[Message]) -> Iterator[StampedFrame]:
         """Frames of a whole stream of messages."""
@@ -91,6 +95,8 @@ class FrameAssembler:
         return frames + (self._without_scan(before=None) if self._ranges else [])
 
     def _add_scan(self, scan: ScanMessage) -> list[StampedFrame]:
+        if self._scan_at is not None and scan.stamp > self._scan_at:
+            self._intervals.append(scan.stamp - self._scan_at)
         self._scan_at = max(scan.stamp, self._scan_at or scan.stamp)
         if self._last is not None and scan.stamp <= self._last:
             self.dropped["scan: stamp not after the one before"] += 1
@@ -99,7 +105,7 @@ class FrameAssembler:
             self.dropped["scan: no beams or no bearings"] += 1
             return []
         waiting = self._without_scan(before=scan.stamp)
-        self._wait_s, self._sees = _SCANLESS_S, True
+        self._wait_s = _SCANLESS_S
         late = [m for m in self._ranges if m.stamp > scan.stamp]
         ready = [m for m in self._ranges if m.stamp <= scan.stamp]
         self._ranges = late
@@ -180,9 +186,15 @@ class FrameAssembler:
             if not overdue or (before is not None and (ready[-1].stamp >= before or not rest)):
                 break
             self._ranges = rest
-            self._wait_s = _BLIND_S if self._sees else _SCANLESS_S
+            self._wait_s = self._silent_wait()
             frames.append(self._close(max(ready[-1].stamp, (self._last or 0) + 1), ready, None))
         return frames
+
+    def _silent_wait(self) -> float:
+        """How long ranges wait while a LiDAR is silent [s]."""
+        if not self._intervals:
+            return _SCANLESS_S
+        return min(max(_BLIND_SCANS * float(np.median(self._intervals)) / 1e9, _BLIND_S), _SCANLESS_S)
 
     def _close(self, stamp: int, ranges: list[RangeMessage], scan: ScanMessage | None) -> StampedFrame:
         dt = 0.0 if self._last is None else (stamp - self._last) / 1e9

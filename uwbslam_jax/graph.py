@@ -162,7 +162,10 @@ class Graph:
         since = self.keyframes[-1].stamp - _FOUND_S * 1e9 if self.keyframes else 0
         loose = [k for k, key in enumerate(self.keyframes) if k > 0 and key.stamp > since and k not in tied]
         if loose:
-            self.edges = [edge for edge in self.edges if edge.new < loose[0]]
+            first = loose[0]
+            self.edges = [edge for edge in self.edges if edge.new < first]
+            self._anchors = [k for k in self._anchors if k < first]
+            self.keyframes[first:] = [replace(key, scan=None) for key in self.keyframes[first:]]
 
     def put(self, poses: np.ndarray, turn: float) -> None:
         """The map was drawn again: keyframes so far are at poses (N, 3) in it, turned by an angle [rad]."""
@@ -228,17 +231,26 @@ class Graph:
                 self.edges.append(Edge(target, new, pose, information))
 
     def _candidates(self, new: int) -> list[int]:
-        """Keyframes to lay the newest one over: the one before, the nearest anchors, the oldest anchor in reach."""
+        """Keyframes to lay the newest one over: the last one, the nearest anchors, the oldest anchor in reach."""
         key = self.keyframes[new]
         poses = np.array([self.keyframes[k].pose for k in self._anchors]).reshape(-1, 3)
         apart = np.linalg.norm(poses[:, :2] - key.pose[:2], axis=1)
         cost = apart + np.abs(wrapped(poses[:, 2] - key.pose[2])) * _TURN_M
         near = [self._anchors[k] for k in np.argsort(cost, kind="stable")[:_NEAREST] if apart[k] < _REACH_M]
         oldest = [self._anchors[k] for k in np.flatnonzero(apart < _REACH_M)[:1]]
-        last = [new - 1] if new > 0 and self.keyframes[new - 1].scan is not None and not key.broken else []
+        last = self._last_seen(new)
         if not len(cost) or cost.min() > _ANCHOR_M:
             self._anchors.append(new)
         return list(dict.fromkeys([*last, *near, *oldest]))
+
+    def _last_seen(self, new: int) -> list[int]:
+        """The keyframe with a scan before the newest one, where the robot was not carried since."""
+        for k in range(new, 0, -1):
+            if self.keyframes[k].broken:
+                break
+            if self.keyframes[k - 1].scan is not None:
+                return [k - 1]
+        return []
 
 
 def map_pose(estimate: Estimate) -> np.ndarray:
