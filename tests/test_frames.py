@@ -255,6 +255,18 @@ def test_ranges_make_a_frame_every_fifth_of_a_second_while_a_lidar_is_silent():
     assert not make.dropped
 
 
+def test_a_slow_scanner_is_not_a_silent_one():
+    """A scan now and then that comes late makes no frames of ranges alone where scans are as far apart as that."""
+    make = assembler(max_ranges=64)
+    ranges = [ranged(0.1 * k, 0, 1 + k % 2, 1.0) for k in range(1, 300)]
+    scans = [scan(0.6 * k) for k in range(1, 48) if k % 10 not in (7, 8, 9)]
+    stream = sorted([*ranges, *scans], key=lambda m: m.stamp)
+    frames = [f for m in stream for f in make.add(m)]
+    alone = [f for f in frames if not f.frame.has_scan and f.stamp < at(0.6 * 46)]
+    assert len(alone) <= 2 * 5  # five gaps of 2.4 s
+    assert not make.dropped
+
+
 def driven(seconds: np.ndarray) -> list[OdometryMessage]:
     return [odometry(t, 0.5 * t, 0.0, 0.3 * t) for t in seconds]
 

@@ -86,12 +86,12 @@ def to_result(session: Session, facts: Facts) -> Result:
 
 
 def _biases(session: Session) -> list[str]:
-    """A warning where biases were found that nobody configured."""
+    """A warning where notable biases were found that nobody configured."""
     ids = {slot: node for node, slot in session.slots.items()}
     found = {ids[slot]: bias for slot, bias in session.found_bias.items()}
     told = ", ".join(f"node {node} {bias:+.2f} m" for node, bias in sorted(found.items()))
     advice = "set uwb.bias if the radios are known"
-    return [f"ranges are biased: {told} were solved from the run; {advice}"] if found else []
+    return [f"ranges are biased: {told} were solved from the run; {advice}"] if session.biased else []
 
 
 def _beacons(session: Session, ids: dict[int, int]) -> list[BeaconEstimate]:

@@ -36,6 +36,8 @@ from uwbslam_jax.tiles import Tiles
 
 CONTROL_EVERY = 10
 """Frames between two looks of the host."""
+_NOTABLE_BIAS = 0.3
+"""A bias larger than this share of sigma_n is told; smaller ones only take up what little was learnt of them."""
 _SOLVE_EVERY_S = 1.0
 """The start-up problem is solved at most this often, in the log's time."""
 
@@ -134,6 +136,12 @@ class Session:
     def slots(self) -> dict[int, int]:
         """Node id -> slot, as far as heard."""
         return self._slots
+
+    @property
+    def biased(self) -> bool:
+        """Whether a bias was found that is worth a user's while."""
+        worth = _NOTABLE_BIAS * self.settings.uwb.sigma_n
+        return any(abs(found) > worth for found in self.found_bias.values())
 
     def room(self) -> int:
         """How many more frames may be stepped before the host has to look."""
@@ -322,9 +330,10 @@ class Session:
     def _learn_biases(self, solution: Solution, now: int) -> None:
         if not solution.biased:
             return
-        if not self.found_bias:
-            self.history.event(now, "ranges are biased: biases and beacons solved from the run so far")
+        told = self.biased
         self.found_bias = solution.bias
+        if self.biased and not told:
+            self.history.event(now, "ranges are biased: biases and beacons solved from the run so far")
         self.params = self._biased(make_params(self.settings, self._slots))
 
     def beacon_status(self, slot: int) -> str:
