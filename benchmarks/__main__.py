@@ -20,6 +20,7 @@ NAMES = {
     "batch": "a whole recording of ten minutes, and many parameter sets at once",
     "uwb": "the filter on ranges alone beside GTSAM",
     "startup": "from the shell to the first pose",
+    "live": "a live run on emulated devices, with faults and kills (20 minutes)",
     "gpu": "many runs at once on a graphics card",
 }
 

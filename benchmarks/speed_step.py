@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.metric import Metric, Report, ratio, spread
-from uwbslam_jax import grid, layout, matching, motion, ranging, session, slam
+from uwbslam_jax import grid, layout, motion, ranging, session, slam, surfaces
 from uwbslam_jax.config import Settings
 from uwbslam_jax.frames import FrameAssembler
 from uwbslam_jax.geometry import rotation
@@ -123,7 +123,7 @@ def _parts(run: Session, frames: list[StampedFrame]) -> list[tuple[str, float]]:
         return ranging.update(belief, frame.ranges, usable, params, state.scatter, robust=True)
 
     def matched(state, sweep):
-        surface = matching.surface(sweep)
+        surface = surfaces.surface(sweep)
         return slam._match(config, params, state, state.belief, sweep, surface, frame.has_scan)
 
     def redrawn(window, pose):

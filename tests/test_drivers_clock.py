@@ -84,6 +84,25 @@ def test_a_damaged_time_is_refused_and_forgotten() -> None:
     assert clock.restarts == 0
 
 
+@pytest.mark.parametrize("by", [10, 60, 190])
+def test_a_time_that_was_damaged_a_little_does_not_move_the_clock(by: int) -> None:
+    """Short sums let one damaged time in 64 through; taken for the least delay it would shift two minutes of stamps."""
+    true, device, received = story(60.0)
+    wrong = device.copy()
+    wrong[[500, 900, 1300]] += by * MS
+    late = errors(DeviceClock(), true, wrong, received)
+    assert np.isnan(late[[500, 900, 1300]]).all()
+    assert np.abs(np.delete(late, [500, 900, 1300])[400:]).max() < 1.0
+
+
+def test_a_delay_that_ends_is_followed() -> None:
+    true, device, received = story(60.0)
+    held = np.arange(true.size) < 800
+    late = errors(DeviceClock(), true, device, received + held * 50 * MS)
+    assert np.isnan(late).sum() == 2
+    assert np.abs(late[810:]).max() < 1.0
+
+
 @pytest.mark.parametrize("shows", [0, 9999 * S])
 def test_a_restarted_device_is_followed_after_a_few_measurements(shows: int) -> None:
     true, device, received = story(60.0, offset=500 * S)

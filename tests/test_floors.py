@@ -19,7 +19,7 @@ FLOORS: dict[float, str] = {
     2.1: "sightings placement relative schemas result_log conditions",
     2.2: "mcap_log scenarios hypotheses",
     2.3: "log_summary",
-    3: "objective tiles",
+    3: "objective tiles surfaces",
     4: "matching",
     4.1: "paper trust",
     5: "slam",

@@ -12,7 +12,7 @@ import small_room as room
 from derivatives import assert_gradient, double
 
 from uwbslam_jax import grid as occupancy
-from uwbslam_jax import matching
+from uwbslam_jax import matching, surfaces
 from uwbslam_jax.ekf import Gaussian
 from uwbslam_jax.slam import undo_motion
 
@@ -21,7 +21,7 @@ SIGMA_L = 0.25
 
 
 def blind_direction(sweep):
-    return matching.blind_direction(matching.surface(sweep), sweep.valid)
+    return matching.blind_direction(surfaces.surface(sweep), sweep.valid)
 
 
 @partial(jax.jit, static_argnums=5)
@@ -31,13 +31,13 @@ def align(grid, sweep, start, prior, sigma_l, resolution):
 
 @partial(jax.jit, static_argnums=3)
 def assess(grid, sweep, pose, resolution):
-    return matching.assess(grid, sweep, matching.surface(sweep), pose, resolution)
+    return matching.assess(grid, sweep, surfaces.surface(sweep), pose, resolution)
 
 
 @partial(jax.jit, static_argnums=4)
 def search(grid, sweep, prior, sigma_l, resolution):
     known = (prior.mean, prior.mean)
-    return matching.search(grid, sweep, matching.surface(sweep), prior, known, sigma_l, resolution)
+    return matching.search(grid, sweep, surfaces.surface(sweep), prior, known, sigma_l, resolution)
 
 
 def sweep_at(pose, beams=BEAMS, walls=room.WALLS):
@@ -125,7 +125,7 @@ def test_the_end_of_a_corridor_tells_nothing_before_it_is_drawn():
 
 
 def share_of_walls(sweep, some, heading) -> np.ndarray:
-    return np.asarray(matching.share_of_walls(matching.surface(sweep), some, sweep.valid, jnp.float32(heading)))
+    return np.asarray(matching.share_of_walls(surfaces.surface(sweep), some, sweep.valid, jnp.float32(heading)))
 
 
 @pytest.mark.parametrize("heading", [0.0, 0.7, -2.0])

@@ -52,6 +52,23 @@ def test_a_scan_finds_its_place_in_another(to, off) -> None:
     assert error @ found.information @ error < 16.3  # chi-square of 3 degrees of freedom, 0.1 %
 
 
+def test_a_scan_most_of_whose_returns_are_missing_finds_its_place_too() -> None:
+    """Black and glass surfaces, a damaged line: a third of the beams come back, other ones each time."""
+    old, new = np.array([0.0, 0.0, 0.3]), np.array([0.3, 0.2, 0.4])
+    rng = np.random.default_rng(3)
+    want = relative(old, new)
+    pair = []
+    for pose in (old, new):
+        whole = snapshot(pose)
+        scan = whole.scan
+        kept = scan.valid & (rng.random(BEAMS) < 0.33)
+        pair.append(whole._replace(scan=scan._replace(ranges=np.where(kept, scan.ranges, 0), valid=kept)))
+    found = laid(*pair, want + np.array([0.1, -0.1, 0.04]))
+    np.testing.assert_allclose(found.pose[:2], want[:2], atol=0.02)
+    assert abs(found.pose[2] - want[2]) < 0.01
+    assert found.share > 0.6
+
+
 def test_a_corridor_tells_nothing_along_itself() -> None:
     old, new = np.zeros(3), np.array([0.6, 0.1, 0.05])
     guess = relative(old, new) + np.array([0.2, 0.1, 0.02])

@@ -16,6 +16,7 @@ from uwbslam_jax.ekf import Gaussian, symmetric_root
 from uwbslam_jax.geometry import rotation, transform_points, wrap_angle
 from uwbslam_jax.grid import Grid, Sweep
 from uwbslam_jax.objective import lidar_gram, lidar_residual, prior_residual
+from uwbslam_jax.surfaces import Surface
 
 _MOVES = (6, 5, 5)
 """Gauss-Newton moves at the finest, middle and every coarser level, at most."""
@@ -27,9 +28,6 @@ _NEARBY_MOVES, _NEARBY_STILL = 3, 0.02
 """Nor more moves, and what its last is shorter than [cells of m or rad]."""
 _CHECKED_BEAMS = 360
 """And more than this do not tell how well it fits where it was expected."""
-_NEIGHBOURS = (1, 2, 4, 8, 16)
-_NORMAL_SPAN = (0.25, 1.0)
-"""A normal needs neighbours this far apart [m]."""
 _BLIND = (0.006, 0.02)
 """Share of normals in the least seen direction below which a scan is blind in it, and above which it is not."""
 _SEARCH_HEADINGS, _SEARCH_BEAMS, _SEARCH_REFINED = 120, 180, 8
@@ -68,45 +66,6 @@ class Blind(NamedTuple):
 
     direction: Float[Array, "2"]
     weight: Float[Array, ""]
-
-
-class Surface(NamedTuple):
-    """Where the beams of a scan meet surfaces whose direction can be told.
-
-    Attributes:
-      tangent: (2, B) unit vectors along the surface in the robot's frame, 0 where there is none.
-      found: (B,) whether there is one.
-    """
-
-    tangent: Float[Array, "2 B"]
-    found: Bool[Array, "B"]
-
-
-def surface(sweep: Sweep) -> Surface:
-    """Surface directions from the two neighbours of a beam that are far enough apart for range noise not to matter;
-    where the three are not on one line there is no surface."""
-    # what is seen is a decision, held when the step is differentiated
-    points, valid = jax.lax.stop_gradient(sweep.points), sweep.valid
-    beams, most = valid.shape[0], _NEIGHBOURS[-1]
-    x, y = points[:, 0], points[:, 1]
-    wide_x, wide_y, wide_valid = (jnp.pad(a, most) for a in (x, y, valid))
-
-    def shifted(a, k):
-        return a[most + k : most + k + beams]
-
-    tx, ty, found = jnp.zeros_like(x), jnp.zeros_like(y), jnp.zeros_like(valid)
-    for k in _NEIGHBOURS:
-        before_x, after_x = shifted(wide_x, -k), shifted(wide_x, k)
-        before_y, after_y = shifted(wide_y, -k), shifted(wide_y, k)
-        dx, dy = after_x - before_x, after_y - before_y
-        span = jnp.sqrt(dx**2 + dy**2)
-        bend = jnp.sqrt((after_x + before_x - 2 * x) ** 2 + (after_y + before_y - 2 * y) ** 2)
-        ok = valid & shifted(wide_valid, -k) & shifted(wide_valid, k) & ~found
-        ok = ok & (span > _NORMAL_SPAN[0]) & (span < _NORMAL_SPAN[1]) & (bend < 0.05 + 0.1 * span)
-        scale = 1.0 / jnp.maximum(span, 1e-6)
-        tx, ty = jnp.where(ok, dx * scale, tx), jnp.where(ok, dy * scale, ty)
-        found = found | ok
-    return Surface(jnp.stack([tx, ty]), found)
 
 
 def blind_direction(surface: Surface, counted: Bool[Array, "B"]) -> Blind:

@@ -15,7 +15,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from uwbslam_jax import grid as occupancy
-from uwbslam_jax import layout, matching, motion, paper, ranging, trust
+from uwbslam_jax import layout, matching, motion, paper, ranging, surfaces, trust
 from uwbslam_jax.config import Config, Params
 from uwbslam_jax.ekf import Gaussian
 from uwbslam_jax.geometry import rotation, safe_norm, transform_points, wrap_angle
@@ -149,7 +149,7 @@ def step(config: Config, params: Params, state: State, frame: Frame) -> tuple[St
         belief = paper.heading_from_velocity(paper.pin_frame(belief, state.frame_slots))
     s = layout.unpack(belief.mean)
     sweep = undo_motion(frame.scan, params.lidar, rotation(-s.heading) @ s.velocities[0], s.yaw_rate)
-    surface = matching.surface(sweep)
+    surface = surfaces.surface(sweep)
     align = _joint_match if config.preset == "paper" else _match_and_fuse
     belief, matched = align(config, params, state, belief, frame, sweep, surface, usable)
     state = state._replace(belief=belief, unrest=matched.unrest, map_spread=matched.map_spread)

@@ -11,6 +11,9 @@ _LOOSE_WHEELS = (0.03, 0.06, 0.02, 0.06)
 """Standard deviation of a step by wheels: floor and share of the way [m], floor and share of the turn [rad]."""
 _LOOSE = (0.1, 0.2, 0.05, 0.1)
 """The same of a step that nothing measured, without what it may have driven in the time."""
+_MATCHED = (0.02, 0.02, 0.01, 0.02)
+"""The same of a step between two scans that were matched with the map: less than two scans tell that can be laid over
+each other, but these may see nothing of the same, or be laid wrong."""
 _LONGEST_S = 3.0
 """So long at most counts with a metre a second."""
 _ASTRAY = (1.0, 0.3)
@@ -38,15 +41,20 @@ def steps(graph: Graph, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
             continue
         wheels = keys[k].wheels
         z = relative(keys[k - 1].pose, keys[k].pose) if wheels is None else wheels
-        floor, share, floor_yaw, share_yaw = _LOOSE if wheels is None else _LOOSE_WHEELS
         elapsed = min((keys[k].stamp - keys[k - 1].stamp) / 1e9, _LONGEST_S) if wheels is None else 0.0
-        length, angle = np.hypot(*z[:2]), abs(wrapped(z[2]))
-        sigma = np.array([floor + share * length + elapsed] * 2 + [floor_yaw + share_yaw * angle])
+        sigma = _sigma(z, _LOOSE if wheels is None else _LOOSE_WHEELS) + np.array([elapsed, elapsed, 0.0])
         old.append(k - 1)
         new.append(k)
         between.append(z)
         roots.append(np.diag(1 / sigma))
         soft.append(False)
+        if not (keys[k - 1].blind or keys[k].blind):
+            z = relative(keys[k - 1].pose, keys[k].pose)
+            old.append(k - 1)
+            new.append(k)
+            between.append(z)
+            roots.append(np.diag(1 / _sigma(z, _MATCHED)))
+            soft.append(True)
     for edge in graph.edges:
         off = relative(poses[edge.old], poses[edge.new]) - edge.between
         if np.hypot(*off[:2]) > _ASTRAY[0] or abs(wrapped(off[2])) > _ASTRAY[1]:
@@ -58,6 +66,13 @@ def steps(graph: Graph, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
         roots.append(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T)
         soft.append(True)
     return np.array(old), np.array(new), np.array(between), np.array(roots), np.array(soft)
+
+
+def _sigma(step: np.ndarray, loose: tuple[float, float, float, float]) -> np.ndarray:
+    """Standard deviation of a step (3,) by its length and its turn [m, m, rad]."""
+    floor, share, floor_yaw, share_yaw = loose
+    along = floor + share * np.hypot(*step[:2])
+    return np.array([along, along, floor_yaw + share_yaw * abs(wrapped(step[2]))])
 
 
 def even_drive(graph: Graph) -> np.ndarray:

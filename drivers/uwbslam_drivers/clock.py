@@ -21,6 +21,9 @@ MOST_DRIFT = 1e-3
 """No device's clock is worse than this; crystals are within 1e-4."""
 SOONER = 0.2
 """A device time this far ahead of the envelope is impossible [s]."""
+EARLY = 5e-3
+"""One this far ahead of it [s] may be a damaged number that its sum did not show; as many as AGREEING in a row are the
+end of a delay."""
 LATER = 5.0
 """Data does not wait longer than this [s]."""
 AGREEING = 3
@@ -57,11 +60,13 @@ class DeviceClock:
         self._delay = least_delay / 1e9
         self._reference = reference
         self._strange: list[tuple[int, int]] = []
+        self._early: list[tuple[float, float]] = []
         self._zero = None if reference is None else self._begin(reference)
 
     def _begin(self, moment: tuple[int, int]) -> tuple[int, int]:
         """Forgets all points; device and host time of a moment [ns, ns] become the zero of both axes."""
         self._zero = moment
+        self._early.clear()
         self._blocks: deque[tuple[float, float]] = deque(maxlen=BLOCKS)
         self._block = -1
         self._offset = 0.0  # of the envelope at the zero [s]
@@ -81,9 +86,23 @@ class DeviceClock:
         if not -SOONER < late - self._envelope(x) < LATER:
             return self._doubt(device, received)
         self._strange.clear()
-        self._add(x, late)
+        if not self._believed(x, late):
+            return None
         ahead = x + self._envelope(x) - self._least_delay(x, late)
         return zero[1] + round(ahead * 1e9)
+
+    def _believed(self, x: float, late: float) -> bool:
+        """Lets a point lower the envelope, unless it does by much and alone."""
+        if self._first is None or late > self._envelope(x) - EARLY:
+            self._early.clear()
+            self._add(x, late)
+            return True
+        self._early.append((x, late))
+        if len(self._early) < AGREEING:
+            return False
+        self._add(*max(self._early, key=lambda point: point[1]))
+        self._early.clear()
+        return True
 
     def _point(self, zero: tuple[int, int], device: int, received: int) -> tuple[float, float]:
         """Receive time less device time, and device time, both since the zero [s]; unwraps the device's clock."""
