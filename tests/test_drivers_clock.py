@@ -91,7 +91,8 @@ def test_a_time_that_was_damaged_a_little_does_not_move_the_clock(by: int) -> No
     wrong = device.copy()
     wrong[[500, 900, 1300]] += by * MS
     late = errors(DeviceClock(), true, wrong, received)
-    assert np.isnan(late[[500, 900, 1300]]).all()
+    assert late[400:].max() < 100.0  # the damaged ones are stamped with their arrival
+    assert (late[[500, 900, 1300]] >= 0.0).all()
     assert np.abs(np.delete(late, [500, 900, 1300])[400:]).max() < 1.0
 
 
@@ -99,7 +100,7 @@ def test_a_delay_that_ends_is_followed() -> None:
     true, device, received = story(60.0, delay=0.1)
     held = np.arange(true.size) < 800
     late = errors(DeviceClock(), true, device, received + held * 50 * MS)
-    assert np.flatnonzero(np.isnan(late)).tolist() == [800, 801]
+    assert not np.isnan(late).any()
     assert np.abs(late[1700:]).max() < 1.0  # by then the window no longer takes the end of the delay for a slope
 
 

@@ -8,7 +8,7 @@ laid on what the track does say, in every way that fits it.
 
 from __future__ import annotations
 
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 
@@ -21,6 +21,11 @@ _WAYS = 2
 """So many ways of laying the ranges' geometry on the track are tried, for each reflection."""
 _PATH_SIGMA = 0.07
 """How well ranges place the robot between beacons that are known [m]."""
+_SIDES = 3
+"""So many choices of the sides are tried."""
+_TRY_ALL = 10
+_TRIALS = 16
+"""Of more beacons than so many not all choices are looked at, but those that so many random ones lead to."""
 _SAME_M = 0.3
 """Beacons closer than this are the same place."""
 
@@ -45,45 +50,63 @@ def explanations(problem: Problem, bias_sigma: float) -> list[Placement]:
     return distinct
 
 
-def track_sides(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
-    """Beacon positions (B, 2) by the track: the sides that fit the beacons' own ranges best, and the other ones."""
+def track_sides(problem: Problem) -> list[np.ndarray]:
+    """Beacon positions (B, 2) by the track: the sides that fit best what was ranged along it and between the beacons,
+    the next best ones, and the other side for all of the best."""
     antenna = problem.antenna(problem.track)
-    near, far = np.zeros((2, len(problem.slots), 2))
+    spots = np.zeros((len(problem.slots), 2, 2))
+    misfit = np.zeros((len(problem.slots), 2))
     for b in range(len(problem.slots)):
         mine = problem.to == b
-        near[b], far[b] = multilaterate(antenna[mine], problem.distance[mine], problem.sigma[mine])
-    choice = _consistent_sides(problem, near, far)
-    return np.where(choice[:, None], far, near), np.where(choice[:, None], near, far)
+        spots[b] = multilaterate(antenna[mine], problem.distance[mine], problem.sigma[mine])
+        apart = np.linalg.norm(antenna[mine, None] - spots[b], axis=2)
+        misfit[b] = _misfit(apart - problem.distance[mine, None], problem.sigma[mine, None]).sum(0)
+    choices = _best_sides(problem, spots, misfit)
+    every = np.arange(len(spots))
+    return [spots[every, choice] for choice in [*choices, 1 - choices[0]]]
 
 
-def _consistent_sides(problem: Problem, near: np.ndarray, far: np.ndarray) -> np.ndarray:
-    """For each beacon, whether its second candidate is the one that agrees with the ranges between beacons."""
-    count = len(problem.slots)
-    if not len(problem.pair):
-        return np.zeros(count, bool)
-    rng = np.random.default_rng(0)
-    best, best_cost = np.zeros(count, bool), np.inf
-    for trial in range(8):
-        choice = np.zeros(count, bool) if trial == 0 else rng.random(count) < 0.5
-        cost = _pair_cost(problem, np.where(choice[:, None], far, near))
-        improved = True
-        while improved:
-            improved = False
-            for b in range(count):
-                choice[b] ^= True
-                other = _pair_cost(problem, np.where(choice[:, None], far, near))
-                if other < cost - 1e-9:
-                    cost, improved = other, True
-                else:
-                    choice[b] ^= True
-        if cost < best_cost:
-            best, best_cost = choice.copy(), cost
-    return best
+def _best_sides(problem: Problem, spots: np.ndarray, misfit: np.ndarray) -> list[np.ndarray]:
+    """For each beacon which of its two places (B, 2, 2) it is at, in the ways that fit best. misfit: (B, 2) of what was
+    ranged along the track."""
+    count = len(spots)
+    if count <= _TRY_ALL:
+        tried = np.array(list(product((0, 1), repeat=count)))
+    else:
+        rng = np.random.default_rng(0)
+        starts = [np.argmin(misfit, axis=1), *rng.integers(0, 2, (_TRIALS, count))]
+        tried = np.unique([_descended(problem, spots, misfit, start) for start in starts], axis=0)
+    cost = _side_cost(problem, spots, misfit, tried)
+    return list(tried[np.argsort(cost, kind="stable")[:_SIDES]])
 
 
-def _pair_cost(problem: Problem, beacons: np.ndarray) -> float:
-    d = np.linalg.norm(beacons[problem.pair[:, 0]] - beacons[problem.pair[:, 1]], axis=1)
-    return float(np.abs(d - problem.pair_distance).sum())
+def _descended(problem: Problem, spots: np.ndarray, misfit: np.ndarray, choice: np.ndarray) -> np.ndarray:
+    """Sides from which no single beacon's other side is better."""
+    while True:
+        flipped = np.vstack([choice, choice ^ np.eye(len(choice), dtype=choice.dtype)])
+        cost = _side_cost(problem, spots, misfit, flipped)
+        if cost.argmin() == 0:
+            return choice
+        choice = flipped[cost.argmin()]
+
+
+def _side_cost(problem: Problem, spots: np.ndarray, misfit: np.ndarray, choices: np.ndarray) -> np.ndarray:
+    """(C,) misfit of ranges along the track and between beacons for choices (C, B)."""
+    every = np.arange(len(spots))
+    cost = misfit[every, choices].sum(1)
+    if len(problem.pair):
+        at = spots[every, choices]
+        apart = np.linalg.norm(at[:, problem.pair[:, 0]] - at[:, problem.pair[:, 1]], axis=2)
+        # the track is not exact, and what it errs by is in the places; that two beacons at rest are as far apart as
+        # hundreds of ranges say is no outlier
+        sigma = np.hypot(problem.pair_sigma, _SAME_M)
+        cost = cost + (np.abs(apart - problem.pair_distance) / sigma).sum(1)
+    return cost
+
+
+def _misfit(error: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """Negative log-likelihood of ranges that may be outliers."""
+    return 0.5 * soften(error / sigma)[0] ** 2
 
 
 def laid_on_track(problem: Problem) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -14,6 +14,9 @@ from uwbslam_jax.keyframes import Buffer, Keyframe, turned
 from uwbslam_jax.multilateration import DECIDED, multilaterate, soften
 
 _MOST_MOVES = 20
+_COARSE = (8.0, 1.0)
+"""The problem is solved twice: first a range may err by so many times as much, or where the start is wrong by more than
+the radio errs all its ranges were outliers, and a beacon could as well be anywhere."""
 _ENOUGH = 0.02
 """The batch problem is solved when a move gains less log-likelihood than this."""
 CALIBRATED_M = 1e-3
@@ -156,13 +159,28 @@ class Problem:
         n, m = self.track.size, self.track.size + 2 * len(self.slots)
         start = self.track if poses is None else poses
         x = np.concatenate([start.ravel(), beacons.ravel(), np.zeros(1 + len(self.slots))])
+        for coarse in _COARSE:
+            x, J, cost = self._descend(x, bias_sigma, coarse)
+        cov = np.linalg.inv(J.T @ J + 1e-9 * np.eye(J.shape[1]))
+        return Placement(
+            x[:n].reshape(-1, 3),
+            self.slots,
+            x[n:m].reshape(-1, 2),
+            cost,
+            cov[:m, :m],
+            x[m:],
+            np.sqrt(np.diag(cov)[m:]),
+        )
+
+    def _descend(self, x: np.ndarray, bias_sigma: float, coarse: float) -> tuple[np.ndarray, np.ndarray, float]:
+        """Unknowns, their Jacobian and the cost where a descent from x ends."""
         damping = 1e-3
-        J, r = self._linearise(x, bias_sigma)
+        J, r = self._linearise(x, bias_sigma, coarse)
         cost = 0.5 * r @ r
         for _ in range(_MOST_MOVES):
             A, g = J.T @ J, J.T @ r
             moved = x - np.linalg.solve(A + damping * np.diag(np.diag(A) + 1e-9), g)
-            new_J, new_r = self._linearise(moved, bias_sigma)
+            new_J, new_r = self._linearise(moved, bias_sigma, coarse)
             new_cost = 0.5 * new_r @ new_r
             if new_cost < cost:
                 done = cost - new_cost < _ENOUGH
@@ -174,23 +192,15 @@ class Problem:
                 damping *= 10
                 if damping > 1e6:
                     break
-        cov = np.linalg.inv(J.T @ J + 1e-9 * np.eye(J.shape[1]))
-        return Placement(
-            x[:n].reshape(-1, 3),
-            self.slots,
-            x[n:m].reshape(-1, 2),
-            float(cost),
-            cov[:m, :m],
-            x[m:],
-            np.sqrt(np.diag(cov)[m:]),
-        )
+        return x, J, float(cost)
 
-    def _linearise(self, x: np.ndarray, bias_sigma: float) -> tuple[np.ndarray, np.ndarray]:
+    def _linearise(self, x: np.ndarray, bias_sigma: float, coarse: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
         """Whitened Jacobian (rows, 3 N + 2 B + 1 + B) and residuals of held start, steps, ranges, pairs and biases."""
         n, m = self.track.size, self.track.size + 2 * len(self.slots)
         poses, beacons, bias = x[:n].reshape(-1, 3), x[n:m].reshape(-1, 2), x[m:]
         blocks = [self._hold_start(poses, len(x)), self._step_rows(poses, len(x))]
-        blocks += [self._range_rows(poses, beacons, bias), self._pair_rows(beacons, bias, len(x))]
+        blocks += [self._range_rows(poses, beacons, bias, coarse)]
+        blocks += [self._pair_rows(beacons, bias, coarse, len(x))]
         prior = np.zeros((len(bias), len(x)))
         prior[:, m:] = np.eye(len(bias)) / bias_sigma
         blocks.append((prior, bias / bias_sigma))
@@ -219,14 +229,15 @@ class Problem:
             J[rows, :, 3 * rows + k] = np.einsum("mij,mj->mi", self.roots, local[:, :, k])
         return J.reshape(-1, columns), np.einsum("mij,mj->mi", self.roots, e).ravel()
 
-    def _range_rows(self, poses, beacons, bias):
+    def _range_rows(self, poses, beacons, bias, coarse):
         ends = self._antenna_ends(poses)
         antenna = (1 - self.share)[:, None] * ends[0] + self.share[:, None] * ends[1]
         u = antenna - beacons[self.to]
         d = np.maximum(np.linalg.norm(u, axis=1), 1e-6)
         unit = u / d[:, None]
-        r, scale = soften((d + bias[0] + bias[1 + self.to] - self.distance) / self.sigma)
-        weight = scale / self.sigma
+        sigma = coarse * self.sigma
+        r, scale = soften((d + bias[0] + bias[1 + self.to] - self.distance) / sigma)
+        weight = scale / sigma
         n, m = poses.size, poses.size + beacons.size
         rows, J = np.arange(len(d)), np.zeros((len(d), m + len(bias)))
         for key, end, part in ((self.at, ends[0], 1 - self.share), (self.after, ends[1], self.share)):
@@ -239,12 +250,13 @@ class Problem:
         J[rows, m], J[rows, m + 1 + self.to] = weight, weight
         return J, r
 
-    def _pair_rows(self, beacons, bias, columns):
+    def _pair_rows(self, beacons, bias, coarse, columns):
         i, j = self.pair.T
         u = beacons[i] - beacons[j]
         d = np.maximum(np.linalg.norm(u, axis=1), 1e-6)
-        r, scale = soften((d + bias[1 + i] + bias[1 + j] - self.pair_distance) / self.pair_sigma)
-        weight = scale / self.pair_sigma
+        sigma = coarse * self.pair_sigma
+        r, scale = soften((d + bias[1 + i] + bias[1 + j] - self.pair_distance) / sigma)
+        weight = scale / sigma
         n, m = self.track.size, self.track.size + beacons.size
         rows, J = np.arange(len(d)), np.zeros((len(d), columns))
         for axis in range(2):

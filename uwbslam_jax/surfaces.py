@@ -79,7 +79,7 @@ def stand_ins(valid: Bool[Array, "B"]) -> tuple[Int[Array, "B"], Bool[Array, "B"
 def _continued(values, valid, way):
     """Values (n, B) with the last valid one carried on into gaps, towards higher beams (way 1) or lower (way -1), and
     where they are valid then."""
-    for stride in _GAPS:
+    for stride in (stride for stride in _GAPS if stride < valid.shape[0]):
         values = jnp.where(valid[None], values, jnp.roll(values, way * stride, axis=-1))
         none = jnp.zeros(stride, bool)
         moved = jnp.append(none, valid[:-stride]) if way > 0 else jnp.append(valid[stride:], none)

@@ -22,8 +22,8 @@ MOST_DRIFT = 1e-3
 SOONER = 0.2
 """A device time this far ahead of the envelope is impossible [s]."""
 EARLY = 5e-3
-"""One this far ahead of it [s] may be a damaged number that its sum did not show; as many as AGREEING in a row are the
-end of a delay."""
+"""One this far ahead of it [s] may be a damaged number that its sum did not show, and moves nothing; as many as AGREEING
+in a row are the end of a delay."""
 LATER = 5.0
 """Data does not wait longer than this [s]."""
 AGREEING = 3
@@ -87,7 +87,7 @@ class DeviceClock:
             return self._doubt(device, received)
         self._strange.clear()
         if not self._believed(x, late):
-            return None
+            return received - round(self._least_delay(x, self._envelope(x)) * 1e9)
         ahead = x + self._envelope(x) - self._least_delay(x, late)
         return zero[1] + round(ahead * 1e9)
 
