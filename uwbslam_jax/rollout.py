@@ -19,7 +19,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from uwbslam_jax import layout, slam
+from uwbslam_jax import slam
 from uwbslam_jax.config import Config, Params, Settings
 from uwbslam_jax.frames import FrameAssembler
 from uwbslam_jax.grid import EPOCH_LEVEL, Grid
@@ -197,15 +197,15 @@ def _step(config: Config, params: Params, state: State, frame: Frame) -> tuple[S
 
 
 def checkpointed(config: Config, params: Params, state: State, frames: Frame) -> Losses:
-    """The same, for reverse mode: checkpoints in two nested levels, of which 2 sqrt(T) states are kept. T has to be a
-    multiple of the whole part of its root.
+    """The same, for reverse mode: a state is kept every sqrt(T) frames, and each chunk is run again on the way back, its
+    loops of Gauss-Newton moves with checkpoints of their own. T has to be a multiple of the whole part of its root.
 
     What is differentiated is the step with its decisions held: cells that are hit, gates, the choice between search and
     match. Where a decision changes the function jumps; the derivative is that between two jumps.
     """
     inner = math.isqrt(frames.dt.shape[0])
-    one = jax.checkpoint(partial(_step, config, params), prevent_cse=False)
-    chunk = jax.checkpoint(lambda s, f: lax.scan(one, s, f), prevent_cse=False)
+    # within a chunk what a step has to remember is kept: less than its map, which does not depend on any parameter
+    chunk = jax.checkpoint(lambda s, f: lax.scan(partial(_step, config, params), s, f), prevent_cse=False)
     nested = jax.tree.map(lambda x: x.reshape(-1, inner, *x.shape[1:]), whole_chunks(frames))
     _, told = lax.scan(chunk, state, nested)
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), told)
@@ -216,18 +216,3 @@ def whole_chunks(frames: Frame) -> Frame:
     count = frames.dt.shape[0]
     inner = math.isqrt(count)
     return jax.tree.map(lambda x: x[: count // inner * inner], frames)
-
-
-def map_bytes(state: State) -> int:
-    """Memory of one state [bytes]: of what is kept at a checkpoint."""
-    return sum(leaf.nbytes for leaf in jax.tree.leaves(state))
-
-
-def robot_track(told: Losses) -> Float[Array, "T 2"]:
-    """Positions (T, 2) [m]."""
-    return told.poses[:, :2]
-
-
-def beacons(rollout: Rollout) -> np.ndarray:
-    """(K, 2) where start-up has placed the nodes [m]; slot 0 is the robot."""
-    return np.asarray(layout.unpack(rollout.state.belief.mean).positions)
