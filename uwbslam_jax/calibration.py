@@ -1,0 +1,333 @@
+"""Where the LiDAR sits and what each node's ranges are too long by, from a whole run: a batch problem over its graph.
+
+The rollout cannot tell: its map is drawn with the very mounting that is asked for. Scans laid over each other tell the
+LiDAR's own motion, whatever its place on the robot; ranges tell where the antenna was, wheels how the robot moved in its
+own frame. LiDAR and antenna alone leave the mounting open by a turn about the antenna: the yaw takes wheels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+from uwbslam_jax import tunable
+from uwbslam_jax.config import Params, Settings
+from uwbslam_jax.frames import FrameAssembler
+from uwbslam_jax.graph import Graph, relative, wrapped
+from uwbslam_jax.keyframes import turned
+from uwbslam_jax.measurements import Message
+from uwbslam_jax.multilateration import soften
+from uwbslam_jax.rollout import RolloutError, fit_nodes
+from uwbslam_jax.run import fit_beams
+from uwbslam_jax.session import Session
+from uwbslam_jax.smoothing import Problem, Solution
+from uwbslam_jax.sparse_rows import Rows, factor
+from uwbslam_jax.startup import compose
+
+_SCALE = 0.1
+"""Spread of the wheels' scale errors, of way and turn."""
+_HELD = 1e-4
+_FIXED = 1e-6
+"""Spread of what is not asked for."""
+_SOFT = 5.0
+"""Whitened length of an edge's residual from which on it counts less (Geman-McClure)."""
+_WHEELS = (0.02, 0.02)
+"""What wheels err by at first, per root of way and of turn [m/m^0.5, rad/rad^0.5]."""
+_WAY, _TURN = 0.01, 0.02
+"""Way and turn that a step counts at least [m, rad]."""
+_ROUNDS = 3
+"""Solutions, each with the wheels' errors that the one before has found."""
+_MOVES, _ENOUGH = 20, 0.02
+_H = 1e-6
+_OBSERVED = 1 / 3
+"""What is known no better than this share of its prior spread is not observed."""
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What was found, p parameters.
+
+    Attributes:
+      names: of the parameters. start, values: (p,) before and after; sigma: (p,) standard deviation [m, rad].
+      told: "" for one that is observed, else "not observed": it has the value it started from.
+    """
+
+    names: tuple[str, ...]
+    start: Array
+    values: Array
+    sigma: Array
+    told: tuple[str, ...]
+
+
+def whole_run(messages: Sequence[Message], settings: Settings) -> Session:
+    """A recording run to its end."""
+    settings = fit_nodes(fit_beams(settings, messages), messages)
+    session = Session(settings)
+    for frame in FrameAssembler(settings, session.config.max_ranges).frames(messages):
+        session.step(frame)
+    session.finish()
+    return session
+
+
+def calibrate(messages: Sequence[Message], settings: Settings, names: Sequence[str], passes: int = 2) -> Calibration:
+    """Finds some of the mounting and the biases. passes: runs of the recording, each with what was found before.
+
+    Raises:
+      RolloutError: start-up decides nothing, or the recording does not name a node that a bias is asked of.
+    """
+    start = np.array([tunable.value(settings, name) for name in names])
+    found = start
+    for _ in range(passes):
+        now = tunable.configured(settings, dict(zip(names, found, strict=True)))
+        session = whole_run(messages, now)
+        if session.hindsight is None:
+            raise RolloutError(f"start-up has decided nothing ({session.status}), or nothing ranged")
+        found, sigma, told = _solve(session, names, start)
+    return Calibration(tuple(names), start, found, sigma, told)
+
+
+def _solve(session: Session, names: Sequence[str], start: Array) -> tuple[Array, Array, tuple[str, ...]]:
+    """Values, standard deviations and what is told. start: what the priors are about."""
+    assert session.hindsight is not None
+    mounting = _Mounting.build(session, session.hindsight.solution)
+    columns = []
+    for name in names:
+        node = name.removeprefix(tunable.BIAS)
+        if name in tunable.MOUNTING:
+            columns.append(mounting.lidar + tunable.MOUNTING[name][0])
+        elif int(node) not in session.slots or session.slots[int(node)] not in mounting.problem.slots:
+            raise RolloutError(f"node {node} is not heard, or not placed: {name} cannot be told")
+        else:
+            columns.append(mounting.problem.slots.index(session.slots[int(node)]) + mounting.bias)
+    at = np.array(columns)
+    offset = start - mounting.configured(at)
+    spread = np.array([tunable.MOUNTING[n][2] if n in tunable.MOUNTING else tunable.BIAS_M for n in names])
+    free, told = np.ones(len(names), bool), [""] * len(names)
+    while True:
+        prior = np.where(free, spread, _FIXED)
+        x, sigma = mounting.minimise(at, prior, offset)
+        share = np.where(free, sigma[at] / spread, 0.0)
+        worst = int(np.argmax(share))
+        if share[worst] < _OBSERVED:
+            break
+        # the worst is put back first: another may be told once it is known
+        free[worst], told[worst] = False, "not observed"
+    values = np.where(free, mounting.configured(at) + x[at], start)
+    return values, np.where(free, sigma[at], np.inf), tuple(told)
+
+
+@dataclass
+class _Mounting:
+    """The problem of `smoothing` with the LiDAR's mounting and the wheels' scales as further unknowns.
+
+    Unknowns: poses (3 N), places (2 B), biases (S), LiDAR x, y, yaw beyond the configured, scale of way and of turn.
+    """
+
+    problem: Problem
+    graph: Graph
+    params: Params
+    lidar0: Array
+    antenna: Array
+    poses: Array
+    start: Array
+    wheels: tuple[float, float] = _WHEELS
+
+    @staticmethod
+    def build(session: Session, solution: Solution) -> _Mounting:
+        p, graph = session.params, session.graph
+        bias, height = np.asarray(session.params.bias, float), np.asarray(p.height, float)
+        places = dict(zip(solution.nodes, solution.beacons, strict=True))
+        problem = Problem.build(graph, solution.poses, places, height, bias, float(p.bias_scale))
+        if problem is None:
+            raise RolloutError("too few ranges to beacons at rest")
+        x = np.append(problem.start(solution.poses, places), np.zeros(5))
+        antenna, lidar = np.asarray(p.antenna, float), np.asarray(p.lidar, float)
+        return _Mounting(problem, graph, p, lidar, antenna, solution.poses, x)
+
+    @property
+    def bias(self) -> int:
+        """Column of the first bias."""
+        return self.problem.size - len(self.problem.slots)
+
+    @property
+    def lidar(self) -> int:
+        """Column of the LiDAR's x."""
+        return self.problem.size
+
+    def configured(self, at: Array) -> Array:
+        """What the run was made with, of the columns asked for."""
+        slots = np.array(self.problem.slots)
+        every = np.zeros(self.problem.size + 5)
+        every[self.bias : self.lidar] = np.asarray(self.params.bias, float)[slots]
+        every[self.lidar : self.lidar + 3] = self.lidar0
+        return every[at]
+
+    def minimise(self, at: Array, prior: Array, offset: Array) -> tuple[Array, Array]:
+        """Unknowns and their standard deviations (0 but for biases and mounting). at, prior, offset: columns that are
+        asked for, their spreads, and what their priors are about."""
+        spread = np.full(self.problem.size + 5, _FIXED)
+        mean = np.zeros(len(spread))
+        spread[self.lidar + 3 :] = _SCALE
+        # a bias that is not asked for is what the run took it for
+        spread[at], mean[at] = prior, offset
+        x = self.start.copy()
+        for _ in range(_ROUNDS):
+            x, J = self._descend(x, spread, mean)
+            self.wheels = self._wheel_errors(x)
+        columns = np.arange(self.bias, len(x))
+        unit = np.zeros((len(x), len(columns)))
+        unit[columns, np.arange(len(columns))] = 1.0
+        cov = factor((J.T @ J + 1e-9 * sparse.eye(len(x))).tocsc()).solve(unit)[columns]
+        sigma = np.zeros(len(x))
+        sigma[columns] = np.sqrt(np.maximum(np.diag(cov), 0.0))
+        return x, sigma
+
+    def _descend(self, x: Array, spread: Array, mean: Array) -> tuple[Array, sparse.csr_matrix]:
+        """Levenberg-Marquardt."""
+        J, r = self._linearise(x, spread, mean)
+        cost, damping = 0.5 * r @ r, 1e-6
+        for _ in range(_MOVES):
+            A = (J.T @ J).tocsc()
+            step = factor(A + damping * sparse.diags(A.diagonal() + 1e-9, format="csc")).solve(J.T @ r)
+            new_J, new_r = self._linearise(x - step, spread, mean)
+            new_cost = 0.5 * new_r @ new_r
+            if new_cost < cost:
+                gain, x, J, r, cost = cost - new_cost, x - step, new_J, new_r, new_cost
+                damping = max(damping / 10, 1e-12)
+                if gain < _ENOUGH:
+                    break
+            elif damping > 1e6:
+                break
+            else:
+                damping *= 10
+        return x, J
+
+    def _linearise(self, x: Array, spread: Array, mean: Array) -> tuple[sparse.csr_matrix, Array]:
+        rows = Rows(len(x))
+        rows.add((x[:3] - self.start[:3]) / _HELD, [(np.arange(3), np.full(3, 1 / _HELD))])
+        tail = np.arange(self.bias, len(x))
+        rows.add((x[tail] - mean[tail]) / spread[tail], [(tail, 1 / spread[tail])])
+        self._scans(rows, x)
+        self._wheels(rows, x)
+        self._ranges(rows, x)
+        self.problem.add_pairs(rows, x)
+        return rows.matrix(), rows.residuals()
+
+    def _scans(self, rows: Rows, x: Array) -> None:
+        p = self.problem
+        keep = p.soft | ~self._rolled()[p.new]
+        old, new, between, roots, soft = (a[keep] for a in (p.old, p.new, p.between, p.roots, p.soft))
+        columns = [*_columns(3 * old, 3), *_columns(3 * new, 3), *_shared(self.lidar, 3, len(old))]
+
+        def residual(v: Array) -> Array:
+            moved = relative(v[:, :3], v[:, 3:6])
+            # the LiDAR's own motion, seen from the robot
+            change = compose(self.lidar0 + v[:, 6:], _inverse(np.broadcast_to(self.lidar0, (len(v), 3))))
+            e = moved - np.where(soft[:, None], compose(compose(change, between), _inverse(change)), between)
+            e[:, 2] = wrapped(e[:, 2])
+            white = np.einsum("eij,ej->ei", roots, e)
+            inside = np.where(soft, 1.0 + np.sum(white**2, axis=1) / _SOFT**2, 1.0)
+            return white / np.sqrt(inside)[:, None]
+
+        _add(rows, x, columns, residual)
+
+    def _rolled(self) -> Array:
+        """(N,) whether wheels measured the way from the keyframe before."""
+        return np.array([key.wheels is not None and not key.broken for key in self.graph.keyframes])
+
+    def _steps(self) -> tuple[Array, Array]:
+        new = np.flatnonzero(self._rolled())
+        new = new[new > 0]
+        return new, np.array([self.graph.keyframes[k].wheels for k in new]).reshape(-1, 3)
+
+    def _wheels(self, rows: Rows, x: Array) -> None:
+        new, wheels = self._steps()
+        if not len(new):
+            return
+        sigma = self._wheel_sigma(wheels)
+        columns = [*_columns(3 * (new - 1), 3), *_columns(3 * new, 3), *_shared(self.lidar + 3, 2, len(new))]
+
+        def residual(v: Array) -> Array:
+            white = _slip(v[:, :3], v[:, 3:6], v[:, 6:], wheels) / sigma
+            return white / np.sqrt(1.0 + np.sum(white**2, axis=1, keepdims=True) / _SOFT**2)
+
+        _add(rows, x, columns, residual)
+
+    def _wheel_sigma(self, wheels: Array) -> Array:
+        along = self.wheels[0] * np.sqrt(np.hypot(wheels[:, 0], wheels[:, 1]) + _WAY)
+        return np.stack([along, along, self.wheels[1] * np.sqrt(np.abs(wheels[:, 2]) + _TURN)], -1)
+
+    def _wheel_errors(self, x: Array) -> tuple[float, float]:
+        """What wheels err by per root of way and of turn, by their residuals (a robust standard deviation)."""
+        new, wheels = self._steps()
+        if not len(new):
+            return self.wheels
+        poses = x[: 3 * self.problem.count].reshape(-1, 3)
+        scales = np.broadcast_to(x[self.lidar + 3 :], (len(new), 2))
+        off = np.abs(_slip(poses[new - 1], poses[new], scales, wheels)) / self._wheel_sigma(wheels)
+        factors = np.median(off[:, :2]) / 0.674, np.median(off[:, 2]) / 0.674
+        return self.wheels[0] * factors[0], self.wheels[1] * factors[1]
+
+    def _ranges(self, rows: Rows, x: Array) -> None:
+        p, n = self.problem, 3 * self.problem.count
+        robot = np.full(len(p.at), self.bias)
+        lidar = _shared(self.lidar, 3, len(p.at))
+        columns = [*_columns(3 * p.at, 3), *_columns(3 * p.at + 3, 3), *_columns(n + 2 * p.to, 2), robot]
+        columns += [p.bias_column(p.to), *lidar]
+        turn = wrapped(self.poses[p.at + 1, 2] - self.poses[p.at, 2])
+
+        def residual(v: Array) -> Array:
+            change = compose(self.lidar0 + v[:, 10:], _inverse(np.broadcast_to(self.lidar0, (len(v), 3))))
+            # robot frames of the run, as seen from those with this mounting
+            back = _inverse(change)
+            shift = compose(back, np.append(self.antenna, 0.0))[:, :2] - self.antenna
+            ends = []
+            for pose, lever, angle in ((v[:, :3], p.before, p.share * turn), (v[:, 3:6], p.after, (p.share - 1) * turn)):
+                moved = lever + turned(angle, shift)
+                there = change[:, :2] + turned(change[:, 2], moved)
+                ends.append(pose[:, :2] + turned(pose[:, 2], there))
+            antenna = (1 - p.share)[:, None] * ends[0] + p.share[:, None] * ends[1]
+            distance = np.sqrt(np.sum((antenna - v[:, 6:8]) ** 2, axis=1) + p.rise**2)
+            return soften((distance + v[:, 8] + v[:, 9] - p.distance) / p.sigma)[0][:, None]
+
+        _add(rows, x, columns, residual)
+
+
+def _slip(old: Array, new: Array, scales: Array, wheels: Array) -> Array:
+    """Motion by wheels of these scales less the motion measured, (n, 3)."""
+    moved = relative(old, new)
+    moved[:, 2] = wrapped(moved[:, 2])
+    e = moved * (1.0 + scales[:, [0, 0, 1]]) - wheels
+    e[:, 2] = wrapped(e[:, 2])
+    return e
+
+
+def _inverse(pose: Array) -> Array:
+    """The inverse of poses (n, 3)."""
+    return np.concatenate([-turned(-pose[:, 2], pose[:, :2]), -pose[:, 2:]], axis=1)
+
+
+def _columns(first: Array, count: int) -> list[Array]:
+    return [first + k for k in range(count)]
+
+
+def _shared(first: int, count: int, rows: int) -> list[Array]:
+    return [np.full(rows, first + k) for k in range(count)]
+
+
+def _add(rows: Rows, x: Array, columns: list[Array], residual: Callable[[Array], Array]) -> None:
+    """Residuals (n, d) of a few unknowns each, with central differences as their derivatives."""
+    v = np.stack([x[column] for column in columns], axis=1)
+    r = residual(v)
+    slopes = []
+    for k in range(v.shape[1]):
+        h = np.zeros(v.shape[1])
+        h[k] = _H
+        slopes.append((residual(v + h) - residual(v - h)) / (2 * _H))
+    for d in range(r.shape[1]):
+        rows.add(r[:, d], [(column, slope[:, d]) for column, slope in zip(columns, slopes, strict=True)])
