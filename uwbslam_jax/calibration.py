@@ -1,8 +1,8 @@
 """Where the LiDAR sits and what each node's ranges are too long by, from a whole run: a batch problem over its graph.
 
 The rollout cannot tell: its map is drawn with the very mounting that is asked for. Scans laid over each other tell the
-LiDAR's own motion, whatever its place on the robot; ranges tell where the antenna was, wheels how the robot moved in its
-own frame. LiDAR and antenna alone leave the mounting open by a turn about the antenna: the yaw takes wheels.
+LiDAR's own motion, whatever its place on the robot; ranges tell where the antenna was, wheels how the robot moved in
+its own frame. LiDAR and antenna alone leave the mounting open by a turn about the antenna: the yaw takes wheels.
 """
 
 from __future__ import annotations
@@ -228,7 +228,7 @@ class _Mounting:
             moved = relative(v[:, :3], v[:, 3:6])
             # the LiDAR's own motion, seen from the robot
             change = compose(self.lidar0 + v[:, 6:], _inverse(np.broadcast_to(self.lidar0, (len(v), 3))))
-            e = moved - np.where(soft[:, None], compose(compose(change, between), _inverse(change)), between)
+            e = moved - compose(compose(change, between), _inverse(change))
             e[:, 2] = wrapped(e[:, 2])
             white = np.einsum("eij,ej->ei", roots, e)
             inside = np.where(soft, 1.0 + np.sum(white**2, axis=1) / _SOFT**2, 1.0)
@@ -287,7 +287,10 @@ class _Mounting:
             back = _inverse(change)
             shift = compose(back, np.append(self.antenna, 0.0))[:, :2] - self.antenna
             ends = []
-            for pose, lever, angle in ((v[:, :3], p.before, p.share * turn), (v[:, 3:6], p.after, (p.share - 1) * turn)):
+            for pose, lever, angle in (
+                (v[:, :3], p.before, p.share * turn),
+                (v[:, 3:6], p.after, (p.share - 1) * turn),
+            ):
                 moved = lever + turned(angle, shift)
                 there = change[:, :2] + turned(change[:, 2], moved)
                 ends.append(pose[:, :2] + turned(pose[:, 2], there))
@@ -331,3 +334,17 @@ def _add(rows: Rows, x: Array, columns: list[Array], residual: Callable[[Array],
         slopes.append((residual(v + h) - residual(v - h)) / (2 * _H))
     for d in range(r.shape[1]):
         rows.add(r[:, d], [(column, slope[:, d]) for column, slope in zip(columns, slopes, strict=True)])
+
+
+def together(found: Sequence[Calibration]) -> Calibration:
+    """What several recordings tell of the same parameters: means by what each is sure of."""
+    first = found[0]
+    weights = np.array(
+        [[0.0 if told else sigma**-2 for told, sigma in zip(c.told, c.sigma, strict=True)] for c in found]
+    )
+    total = weights.sum(axis=0)
+    known = total > 0
+    mean = np.sum(weights * np.array([c.values for c in found]), axis=0) / np.where(known, total, 1.0)
+    sigma = np.where(known, 1.0 / np.sqrt(np.where(known, total, 1.0)), np.inf)
+    told = tuple("" if any_told else "not observed" for any_told in known)
+    return Calibration(first.names, first.start, np.where(known, mean, first.start), sigma, told)

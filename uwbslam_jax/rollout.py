@@ -150,7 +150,7 @@ def _in_window(config: Config, params: Params, state: State, kept: Sequence[Stam
 
 def _ends(frame: Frame, pose: np.ndarray) -> np.ndarray:
     """Where some of a scan's beams end, about (n, 2) [m]."""
-    some = np.flatnonzero(frame.scan.valid)[:: _EVERY_BEAM]
+    some = np.flatnonzero(frame.scan.valid)[::_EVERY_BEAM]
     bearing = pose[2] + frame.scan.angle_min + some * frame.scan.angle_increment
     return pose[:2] + frame.scan.ranges[some, None] * np.stack([np.cos(bearing), np.sin(bearing)], -1)
 
@@ -197,8 +197,8 @@ def _step(config: Config, params: Params, state: State, frame: Frame) -> tuple[S
 
 
 def checkpointed(config: Config, params: Params, state: State, frames: Frame) -> Losses:
-    """The same, for reverse mode: a state is kept every sqrt(T) frames, and each chunk is run again on the way back, its
-    loops of Gauss-Newton moves with checkpoints of their own. T has to be a multiple of the whole part of its root.
+    """The same, for reverse mode: a state is kept every sqrt(T) frames, and each chunk is run again on the way back,
+    its loops of Gauss-Newton moves with checkpoints of their own. T has to be a multiple of its root's whole part.
 
     What is differentiated is the step with its decisions held: cells that are hit, gates, the choice between search and
     match. Where a decision changes the function jumps; the derivative is that between two jumps.

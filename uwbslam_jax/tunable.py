@@ -1,4 +1,4 @@
-"""Which parameters can be tuned: their names, where they stand in Params and in the settings, and what is known of them.
+"""What can be tuned: names of parameters, where they stand in Params and in the settings, and what is known of them.
 
 Noises are tuned as logarithms, geometry (range biases, where the LiDAR sits) as it is.
 """
