@@ -1,4 +1,4 @@
-"""How good noise parameters are for recordings, by value and gradient: likelihood of rollouts, or error of their tracks.
+"""How good noise parameters are for recordings, by value and gradient: likelihood of rollouts, or their tracks' error.
 
 Each rollout has a first part that is fitted and a last one that is held out.
 """

@@ -190,12 +190,12 @@ def update(
     normalised = innovation / jnp.sqrt(S)
     weight = jnp.where(usable, robust_weight(normalised) if robust else 1.0, 0.0)
     scaled = H * (weight / variance)[:, None]
-    log_likelihood = jnp.sum(jnp.where(usable, _log_density(innovation, S, robust), 0.0))
+    log_likelihood = jnp.sum(jnp.where(usable, log_density(innovation, S, robust), 0.0))
     after = ekf.update_information(belief, H.T @ scaled, scaled.T @ innovation)
     return after, RangeUpdate(innovation, normalised, weight, log_likelihood), scatter
 
 
-def _log_density(innovation, S, robust):
+def log_density(innovation: Float[Array, "*m"], S: Float[Array, "*m"], robust: bool) -> Float[Array, "*m"]:
     """Log density of innovations [1/m]. The robust one is a normal one for most ranges and an even one for the rest: it
     integrates to one. What the weights belong to does not (their loss is bounded), and would have sigma_n go to 0."""
     normal = -0.5 * (innovation**2 / S + jnp.log(2 * jnp.pi * S))

@@ -115,6 +115,6 @@ def _slice(plt: Any, objective: Objective, tuned: Tuned, told: list[int]) -> Any
     x, y = (tuned.values[k] * np.exp(steps) for k, steps in zip((first, second), axis, strict=True))
     filled = axes.contourf(x, y, np.minimum(losses - losses.min(), _WORST), levels=20, cmap="viridis_r")
     axes.plot(tuned.values[first], tuned.values[second], "r+", markersize=12)
-    axes.set(xlabel=tuned.names[first], ylabel=tuned.names[second], xscale="log", yscale="log")
+    axes.set(xlabel=tuned.names[first], ylabel=tuned.names[second])
     figure.colorbar(filled, ax=axes, label="log-likelihood below the best")
     return figure
