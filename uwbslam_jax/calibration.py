@@ -32,14 +32,13 @@ _SCALE = 0.1
 _HELD = 1e-4
 _FIXED = 1e-6
 """Spread of what is not asked for."""
-_SOFT = 5.0
-"""Whitened length of an edge's residual from which on it counts less (Geman-McClure)."""
+_STAGES = ((1000.0, 4.0), (30.0, 2.0), (5.0, 1.0), (5.0, 1.0))
+"""One solution after the other, as in `smoothing`: whitened length of an edge's residual from which on it counts less
+(Geman-McClure), how many times as much a range may err. Each has the wheels' errors that the one before has found."""
 _WHEELS = (0.02, 0.02)
 """What wheels err by at first, per root of way and of turn [m/m^0.5, rad/rad^0.5]."""
 _WAY, _TURN = 0.01, 0.02
 """Way and turn that a step counts at least [m, rad]."""
-_ROUNDS = 3
-"""Solutions, each with the wheels' errors that the one before has found."""
 _MOVES, _ENOUGH = 20, 0.02
 _H = 1e-6
 _OBSERVED = 1 / 3
@@ -87,38 +86,51 @@ def calibrate(messages: Sequence[Message], settings: Settings, names: Sequence[s
         session = whole_run(messages, now)
         if session.hindsight is None:
             raise RolloutError(f"start-up has decided nothing ({session.status}), or nothing ranged")
-        found, sigma, told = _solve(session, names, start)
+        solution = session.hindsight.solution
+        found, sigma, told = solve(session.graph, session.params, solution, session.slots, names, start)
     return Calibration(tuple(names), start, found, sigma, told)
 
 
-def _solve(session: Session, names: Sequence[str], start: Array) -> tuple[Array, Array, tuple[str, ...]]:
-    """Values, standard deviations and what is told. start: what the priors are about."""
-    assert session.hindsight is not None
-    mounting = _Mounting.build(session, session.hindsight.solution)
+def solve(
+    graph: Graph, params: Params, solution: Solution, slots: dict[int, int], names: Sequence[str], start: Array
+) -> tuple[Array, Array, tuple[str, ...]]:
+    """Values, standard deviations and what is told of each parameter.
+
+    Args:
+      params: what the graph was made with. solution: of the graph, to start from. slots: node id -> slot.
+      start: (p,) what the priors are about.
+
+    Raises:
+      RolloutError: a bias is asked of a node that is not heard, or there are too few ranges.
+    """
+    mounting = _Mounting.build(graph, params, solution)
     columns = []
     for name in names:
         node = name.removeprefix(tunable.BIAS)
         if name in tunable.MOUNTING:
             columns.append(mounting.lidar + tunable.MOUNTING[name][0])
-        elif int(node) not in session.slots or session.slots[int(node)] not in mounting.problem.slots:
+        elif slots.get(int(node)) not in mounting.problem.slots:
             raise RolloutError(f"node {node} is not heard, or not placed: {name} cannot be told")
         else:
-            columns.append(mounting.problem.slots.index(session.slots[int(node)]) + mounting.bias)
+            columns.append(mounting.problem.slots.index(slots[int(node)]) + mounting.bias)
     at = np.array(columns)
     offset = start - mounting.configured(at)
     spread = np.array([tunable.MOUNTING[n][2] if n in tunable.MOUNTING else tunable.BIAS_M for n in names])
-    free, told = np.ones(len(names), bool), [""] * len(names)
+    movable = np.array([name in tunable.MOUNTING for name in names])
+    free = np.ones(len(names), bool)
     while True:
-        prior = np.where(free, spread, _FIXED)
-        x, sigma = mounting.minimise(at, prior, offset)
+        x, sigma = mounting.minimise(at, np.where(free, spread, _FIXED), offset)
         share = np.where(free, sigma[at] / spread, 0.0)
-        worst = int(np.argmax(share))
-        if share[worst] < _OBSERVED:
+        worst = int(np.argmax(np.where(movable, share, 0.0)))
+        if not movable.any() or share[worst] < _OBSERVED:
             break
-        # the worst is put back first: another may be told once it is known
-        free[worst], told[worst] = False, "not observed"
-    values = np.where(free, mounting.configured(at) + x[at], start)
-    return values, np.where(free, sigma[at], np.inf), tuple(told)
+        # of the mounting the worst is taken as configured: the others may be told beside it
+        free[worst] = False
+    # a bias that is not told stays free, as little known as it is: none of the others may make up for it
+    observed = free & (share < _OBSERVED)
+    values = np.where(observed, mounting.configured(at) + x[at], start)
+    told = tuple("" if seen else "not observed" for seen in observed)
+    return values, np.where(observed, sigma[at], np.inf), told
 
 
 @dataclass
@@ -136,11 +148,11 @@ class _Mounting:
     poses: Array
     start: Array
     wheels: tuple[float, float] = _WHEELS
+    stage: tuple[float, float] = _STAGES[0]
 
     @staticmethod
-    def build(session: Session, solution: Solution) -> _Mounting:
-        p, graph = session.params, session.graph
-        bias, height = np.asarray(session.params.bias, float), np.asarray(p.height, float)
+    def build(graph: Graph, p: Params, solution: Solution) -> _Mounting:
+        bias, height = np.asarray(p.bias, float), np.asarray(p.height, float)
         places = dict(zip(solution.nodes, solution.beacons, strict=True))
         problem = Problem.build(graph, solution.poses, places, height, bias, float(p.bias_scale))
         if problem is None:
@@ -176,7 +188,7 @@ class _Mounting:
         # a bias that is not asked for is what the run took it for
         spread[at], mean[at] = prior, offset
         x = self.start.copy()
-        for _ in range(_ROUNDS):
+        for self.stage in _STAGES:
             x, J = self._descend(x, spread, mean)
             self.wheels = self._wheel_errors(x)
         columns = np.arange(self.bias, len(x))
@@ -215,23 +227,31 @@ class _Mounting:
         self._scans(rows, x)
         self._wheels(rows, x)
         self._ranges(rows, x)
-        self.problem.add_pairs(rows, x)
+        self.problem.add_pairs(rows, x, self.stage[1])
         return rows.matrix(), rows.residuals()
 
     def _scans(self, rows: Rows, x: Array) -> None:
+        """The LiDAR's own motions. Compared in its own frame, where they are the same whatever the mounting is: in the
+        robot's a turn of the frame would turn the residuals, and pass for something that they tell."""
         p = self.problem
         keep = p.soft | ~self._rolled()[p.new]
         old, new, between, roots, soft = (a[keep] for a in (p.old, p.new, p.between, p.roots, p.soft))
         columns = [*_columns(3 * old, 3), *_columns(3 * new, 3), *_shared(self.lidar, 3, len(old))]
+        own, back = self.lidar0[None], _inverse(self.lidar0[None])
+        motion = compose(compose(back, between), own)
+
+        def on_robot(m: Array) -> Array:
+            return compose(compose(own, m), back)
+
+        slopes = [(on_robot(motion + h) - on_robot(motion - h)) / (2 * _H) for h in _H * np.eye(3)]
+        roots = roots @ np.stack(slopes, axis=-1)
 
         def residual(v: Array) -> Array:
-            moved = relative(v[:, :3], v[:, 3:6])
-            # the LiDAR's own motion, seen from the robot
-            change = compose(self.lidar0 + v[:, 6:], _inverse(np.broadcast_to(self.lidar0, (len(v), 3))))
-            e = moved - compose(compose(change, between), _inverse(change))
+            lidar = self.lidar0 + v[:, 6:]
+            e = relative(compose(v[:, :3], lidar), compose(v[:, 3:6], lidar)) - motion
             e[:, 2] = wrapped(e[:, 2])
             white = np.einsum("eij,ej->ei", roots, e)
-            inside = np.where(soft, 1.0 + np.sum(white**2, axis=1) / _SOFT**2, 1.0)
+            inside = np.where(soft, 1.0 + np.sum(white**2, axis=1) / self.stage[0] ** 2, 1.0)
             return white / np.sqrt(inside)[:, None]
 
         _add(rows, x, columns, residual)
@@ -254,7 +274,7 @@ class _Mounting:
 
         def residual(v: Array) -> Array:
             white = _slip(v[:, :3], v[:, 3:6], v[:, 6:], wheels) / sigma
-            return white / np.sqrt(1.0 + np.sum(white**2, axis=1, keepdims=True) / _SOFT**2)
+            return white / np.sqrt(1.0 + np.sum(white**2, axis=1, keepdims=True) / self.stage[0] ** 2)
 
         _add(rows, x, columns, residual)
 
@@ -296,7 +316,7 @@ class _Mounting:
                 ends.append(pose[:, :2] + turned(pose[:, 2], there))
             antenna = (1 - p.share)[:, None] * ends[0] + p.share[:, None] * ends[1]
             distance = np.sqrt(np.sum((antenna - v[:, 6:8]) ** 2, axis=1) + p.rise**2)
-            return soften((distance + v[:, 8] + v[:, 9] - p.distance) / p.sigma)[0][:, None]
+            return soften((distance + v[:, 8] + v[:, 9] - p.distance) / (self.stage[1] * p.sigma))[0][:, None]
 
         _add(rows, x, columns, residual)
 

@@ -85,7 +85,7 @@ def fit(objective: Objective, progress: Progress = lambda text: None) -> Tuned:
         hidden = np.flatnonzero(objective.free & ~(sigma < _OBSERVED))
         if not len(hidden):
             break
-        for k in hidden:
+        for k in map(int, hidden):
             logs[k], told[objective.names[k]] = _bound(objective, logs, k)
             progress(f"{objective.names[k]} {told[objective.names[k]]}")
         # the others are fitted once more beside those that stay where they are now
