@@ -50,6 +50,7 @@ def cost(quick: bool) -> Iterator[Metric]:
     logs = jnp.log(jnp.array([float(getattr(params, name)) for name in _NAMES]))
     compiled = jax.jit(jax.value_and_grad(total)).lower(logs, state, frames).compile()
     memory = compiled.memory_analysis()
+    assert memory is not None
     size = memory.temp_size_in_bytes + memory.output_size_in_bytes + memory.argument_size_in_bytes
     forward = _seconds(lambda: losses(config, params, state, frames))
     both = _seconds(lambda: compiled(logs, state, frames))

@@ -74,7 +74,7 @@ def _fit(model: str, pairs: list[tuple[int, int]], link: jax.Array, error: jax.A
     def unpack(x):
         if model == "link":
             return _BIAS_M * x[:count], _WIDE_M * jnp.exp(x[count:])
-        bias = _BIAS_M * (ends @ x[1:]) if model == "node" else jnp.zeros(count)
+        bias = _BIAS_M * (jnp.asarray(ends) @ x[1:]) if model == "node" else jnp.zeros(count)
         return bias, _WIDE_M * jnp.exp(jnp.full(count, x[0]))
 
     size = {"sigma_n": 1, "node": 1 + len(nodes), "link": 2 * count}[model]
