@@ -29,7 +29,7 @@ FLOORS: dict[float, str] = {
     5.3: "smoothing",
     6: "startup beacons",
     6.1: "history",
-    6.15: "hindsight",
+    6.15: "hindsight mounting",
     6.17: "revision",
     6.2: "session",
     6.3: "findings",
