@@ -51,7 +51,7 @@ def test_gradient_through_fifty_steps_agrees_with_central_differences(room_map):
     logs = jnp.log(jnp.array([0.1, 1.0, 0.25, 2.0]))
     both = value_and_gradient(value)
     # small enough to stay clear of the borders of cells over all steps; its rounding is then 1e-6 of the values
-    gradient = assert_reverse(both, logs, frames, rtol=1e-3, atol=1e-3, count=2, step=1e-8)
+    gradient = assert_reverse(both, logs, frames, rtol=1e-3, atol=1e-3, count=1, step=1e-8)
     assert np.all(np.abs(gradient) > 0)
 
 

@@ -18,7 +18,7 @@ from uwbslam_jax.frames import FrameAssembler
 from uwbslam_jax.graph import Graph
 from uwbslam_jax.measurements import Message
 from uwbslam_jax.mounting import FIXED, Mounting
-from uwbslam_jax.rollout import RolloutError, fit_nodes
+from uwbslam_jax.rollout import RolloutError
 from uwbslam_jax.run import fit_beams
 from uwbslam_jax.session import Session
 from uwbslam_jax.smoothing import Solution
@@ -47,7 +47,7 @@ class Calibration:
 
 def whole_run(messages: Sequence[Message], settings: Settings) -> Session:
     """A recording run to its end."""
-    settings = fit_nodes(fit_beams(settings, messages), messages)
+    settings = fit_beams(settings, messages)
     session = Session(settings)
     for frame in FrameAssembler(settings, session.config.max_ranges).frames(messages):
         session.step(frame)
@@ -56,7 +56,8 @@ def whole_run(messages: Sequence[Message], settings: Settings) -> Session:
 
 
 def calibrate(messages: Sequence[Message], settings: Settings, names: Sequence[str], passes: int = 2) -> Calibration:
-    """Finds some of the mounting and the biases. passes: runs of the recording, each with what was found before.
+    """Finds some of the mounting and the biases. passes: runs of the recording, each made
+    with what was found before: scans are put straight, and laid over each other, with a mounting.
 
     Raises:
       RolloutError: start-up decides nothing, or the recording does not name a node that a bias is asked of.

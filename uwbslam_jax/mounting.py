@@ -38,7 +38,8 @@ Array = np.ndarray
 class Mounting:
     """The problem of `smoothing` with the LiDAR's mounting and the wheels' scales as further unknowns.
 
-    Unknowns of N keyframes, B resting beacons, S slots: poses (3 N), places (2 B), biases (S), LiDAR x, y, yaw beyond the configured, scale of way and of turn.
+    Unknowns of N keyframes, B resting beacons, S slots: poses (3 N), places (2 B), biases (S), the LiDAR's x, y, yaw
+    beyond the configured, scales of way and of turn.
     """
 
     problem: Problem
