@@ -47,8 +47,8 @@ def measure(*, quick: bool) -> Report:
         _draw(table, gammas)
     about = (
         f"Median robot RMS of {len(seeds)} seeds after one rigid motion over robot and beacons, as published; 60 s, "
-        "ranges of 0.1 m, 361 beams. All pairs, 10 Hz: of five beacons where there are "
-        "many ranges, of three where there are few. The poor hall is the rich one's outline without niches and furniture, seen 8 m far."
+        "ranges of 0.1 m, 361 beams. All pairs, 10 Hz: of five beacons where there are many ranges, of three where "
+        "there are few. The poor hall is the rich one's outline without niches and furniture, seen 8 m far."
     )
     return Report("Gamma of the paper", about, list(_metrics(table, gammas)))
 
