@@ -36,8 +36,9 @@ BIAS = "bias."
 """A node's range bias is called by this and the node's id [m]."""
 BIAS_M = 0.3
 """How far a bias may be off the configured one [m]."""
-DEFAULTS = {"robust": ("sigma_n", "sigma_w", "sigma_l"), "paper": ("gamma", "sigma_n", "sigma_w_paper")}
-"""What is tuned where nothing is named."""
+DEFAULTS = {"robust": ("sigma_n", "sigma_l"), "paper": ("gamma", "sigma_n", "sigma_w_paper")}
+"""What is tuned where nothing is named: the sensors. sigma_w tells how a recording was driven: another one, or a start
+from rest, which no rollout sees, may be rougher."""
 LOG_SPREAD = math.log(10.0)
 """Spread of the logarithm of a noise that nothing is known of but its default: a factor of ten."""
 

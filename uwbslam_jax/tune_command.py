@@ -39,7 +39,7 @@ class TuneOptions:
     """Folder for tuned.toml, the table and the pictures; it is created."""
     params: tuple[str, ...] = ()
     """What to tune: sigma_n, sigma_w, sigma_w_yaw, sigma_w_beacon, sigma_l, sigma_map, gamma ..., bias.ID, lidar.x,
-    lidar.y, lidar.yaw. By default sigma_n, sigma_w, sigma_l."""
+    lidar.y, lidar.yaw. By default sigma_n and sigma_l."""
     objective: Literal["likelihood", "truth"] = "likelihood"
     """What noises are tuned for: the likelihood of ranges and matches, or the track's error where there is truth."""
     config: Path | None = None
