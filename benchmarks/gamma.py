@@ -90,10 +90,10 @@ def made(place: str, ranges: str, seed: int) -> Scenario:
 
 
 def _error(messages, gamma: float) -> float:
-    """Robot RMS [m]; NaN where start-up decides nothing."""
+    """Robot RMS [m]; NaN where start-up decides nothing, or the state is not finite any more."""
     settings = Settings(filter=FilterSettings(preset="paper", gamma=gamma))
     result, truth = run_messages(messages, settings)
-    if result.summary["decided_at"] is None or truth is None:
+    if result.summary["decided_at"] is None or truth is None or not np.isfinite(result.poses).all():
         return float("nan")
     beacons = {beacon.id: beacon.position for beacon in result.beacons}
     return float(evaluate(result.stamps, result.poses, beacons, truth)["robot_rmse_m"])
