@@ -146,6 +146,21 @@ def test_a_jump_nearby_is_told_and_does_not_hold_up_the_others():
     np.testing.assert_allclose(np.log(found.values[0]), 0.7, atol=0.01)
 
 
+class Twofold(Known):
+    """Two valleys, the deeper one beyond a ridge at the start."""
+
+    def value_and_gradient(self, logs):
+        self.best, (near, slope) = np.array([-0.5]), super().value_and_gradient(logs)
+        self.best, (deep, other) = np.array([0.7]), super().value_and_gradient(logs)
+        deep -= 50.0 / self.weight
+        return min(near, deep), slope if near < deep else other
+
+
+def test_the_deeper_of_two_valleys_is_found():
+    found = tuning.fit(Twofold([0.0], [500.0]))
+    np.testing.assert_allclose(np.log(found.values), [0.7], atol=0.01)
+
+
 # Names and settings.
 
 

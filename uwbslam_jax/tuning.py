@@ -25,6 +25,9 @@ _STANDSTILL = 0.5
 """or when two steps gained less than this log-likelihood each."""
 _PATIENCE = 3
 """The fit is stopped early when the held-out part got worse so many times in a row."""
+_SCANNED = (0.25, 0.5, 2.0, 4.0)
+"""Multiples of each value that are tried before the fit: there may be more than one minimum. Where sigma_n is far too
+small the filter takes every pair for one behind a wall, raises its noise, and is content with that."""
 _STEP = 0.05
 """Of the differences of gradients that give the Hessian, in logarithms."""
 _LONGEST = 0.3
@@ -78,7 +81,7 @@ def fit(objective: Objective, progress: Progress = lambda text: None) -> Tuned:
     start = objective.start
     told = dict.fromkeys(objective.names, "")
     history: list[tuple[float, float]] = []
-    logs, stopped = _descend(objective, start, history, progress)
+    logs, stopped = _descend(objective, _scanned(objective), history, progress)
     hessian, jumps = _hessian(objective, logs, progress)
     while objective.free.any():
         sigma = _sigma(hessian, objective.free)
@@ -106,6 +109,20 @@ def fit(objective: Objective, progress: Progress = lambda text: None) -> Tuned:
         objective.held_out(logs),
         objective.evaluations,
     )
+
+
+def _scanned(objective: Objective) -> np.ndarray:
+    """The best place to begin at, of multiples of one parameter after the other."""
+    logs = objective.start.copy()
+    least = objective.value(logs)
+    for k in range(len(logs)):
+        for move in np.log(_SCANNED):
+            tried = logs.copy()
+            tried[k] = objective.start[k] + move
+            found = objective.value(tried)
+            if found < least:
+                logs, least = tried, found
+    return logs
 
 
 def _descend(objective: Objective, start: np.ndarray, history, progress: Progress) -> tuple[np.ndarray, str]:
