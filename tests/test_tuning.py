@@ -106,7 +106,7 @@ class Known(Objective):
         gradient = gradient + logs / tunable.LOG_SPREAD**2
         if self.floor is not None:
             noise, floor = np.exp(2 * logs[-1]), np.exp(2 * self.floor)
-            total, gradient[-1] = total + 60 * np.log(noise + floor), gradient[-1] + 120 * noise / (noise + floor)
+            total, gradient[-1] = total + 20 * np.log(noise + floor), gradient[-1] + 40 * noise / (noise + floor)
         return total / self.weight + (logs[-1] > self.jump), np.where(self.free, gradient, 0.0) / self.weight
 
     def held_out(self, logs):
@@ -150,8 +150,10 @@ class Twofold(Known):
     """Two valleys, the deeper one beyond a ridge at the start."""
 
     def value_and_gradient(self, logs):
-        self.best, (near, slope) = np.array([-0.5]), super().value_and_gradient(logs)
-        self.best, (deep, other) = np.array([0.7]), super().value_and_gradient(logs)
+        self.best = np.array([-0.5])
+        near, slope = super().value_and_gradient(logs)
+        self.best = np.array([0.7])
+        deep, other = super().value_and_gradient(logs)
         deep -= 50.0 / self.weight
         return min(near, deep), slope if near < deep else other
 
