@@ -16,6 +16,7 @@ from benchmarks.intervals import disturbed
 from benchmarks.sharpness import occupied, own_fit, sharpness, stray, wall_distances
 from benchmarks.suite import Check
 from uwbslam_jax.conditions import Scenario
+from uwbslam_jax.config import Settings
 from uwbslam_jax.measurements import Message
 from uwbslam_jax.metrics import RigidMotion, Truth, align, consistency, evaluate, wrap
 from uwbslam_jax.result import MapImage, Result
@@ -72,8 +73,8 @@ def resident_mb() -> float:
     return int(told.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20 if told.exists() else NAN
 
 
-def measure(scenario: Scenario) -> Outcome:
-    """Simulates, runs with the defaults and compares.
+def measure(scenario: Scenario, settings: Settings | None = None) -> Outcome:
+    """Simulates, runs with the defaults, or with settings of another kind, and compares.
 
     The figures are robot_rmse_m (where the robot is not disturbed), online_rmse_m (the same of what was published on
     the way, laid over the truth by itself), robot_max_m, heading_deg_median, beacon_mean_m,
@@ -81,7 +82,7 @@ def measure(scenario: Scenario) -> Outcome:
     pose_nees_ratio and beacon_nees_ratio; NaN where there is nothing to compare.
     """
     messages = _Watched(list(simulate(scenario)))
-    result, truth = run_messages(messages, from_dict(settings_overrides(scenario)))
+    result, truth = run_messages(messages, settings or from_dict(settings_overrides(scenario)))
     assert truth is not None
     apart = disturbed(scenario)
     beacons = {beacon.id: beacon.position for beacon in result.beacons}

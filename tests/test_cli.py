@@ -220,6 +220,31 @@ class TestRun:
         assert fit_beams(settings, scans).lidar.max_beams == slots
 
 
+def test_tune_writes_settings_that_run_takes(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Without noises: their gradient takes long to compile."""
+    words = [
+        "tune",
+        str(log),
+        "-o",
+        str(tmp_path),
+        "--params",
+        "bias.7",
+        "lidar.yaw",
+        "--map.size-m",
+        "25.6",
+        "--quiet",
+    ]
+    assert main(words) == 0
+    told = capsys.readouterr().out
+    settings = settings_file.load(tmp_path / "tuned.toml")
+    assert settings.map.size_m == 25.6
+    assert abs(settings.uwb.bias["7"]) < 0.1  # there is none
+    assert settings.robot.lidar == (0.0, 0.0, 0.0)
+    assert "| lidar.yaw | rad | 0.0000 | 0.0000 | - | not observed |" in told  # there are no wheels
+    assert (tmp_path / "tuning.md").read_text() in told
+    assert json.loads((tmp_path / "tuning.json").read_text())["calibration"]["names"] == ["bias.7", "lidar.yaw"]
+
+
 def test_inspect(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["inspect", str(log)]) == 0
     told = capsys.readouterr().out
@@ -276,6 +301,13 @@ WRONG: dict[str, tuple[list[Any], str]] = {
     "duration": (["demo", "--duration", "0", "-o", "out"], "duration 0 s"),
     "command": (["ran", "x.mcap"], "no command ran, did you mean run?"),
     "no run": (["evaluate", "none", "none.mcap"], "trajectory.tum: No such file"),
+    "no parameter": (
+        ["tune", "x.mcap", "-o", "out", "--params", "sigma_m"],
+        "no parameter sigma_m to tune, did you mean",
+    ),
+    "no ranges to tune by": (["tune", "x.mcap", "-o", "out", "--filter.lidar-only"], "filter.lidar_only = true"),
+    "no truth": (["tune", ranges_only, "-o", "out", "--objective", "truth"], "has no ground truth of the robot"),
+    "no start-up": (["tune", ranges_only, "-o", "out"], "ranges.mcap: start-up has decided nothing"),
     "inspect": (["inspect", text_file("a.mcap", "")], "the file is empty"),
 }
 

@@ -185,7 +185,7 @@ def test_derivatives_agree_with_differences() -> None:
     keys = [replace(key, informed=np.zeros((3, 3))) for key in graph.keyframes]  # blind: the even drive counts
     graph.keyframes = keys
     places = {(slot, 0): spot for slot, spot in BEACONS.items()}
-    problem = smoothing._Problem.build(
+    problem = smoothing.Problem.build(
         graph, graph.poses(), places, np.array([0.0, 1.0, 0.5, 0.0, 2.0]), np.zeros(K), 0.02
     )
     rng = np.random.default_rng(3)

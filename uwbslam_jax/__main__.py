@@ -16,6 +16,7 @@ from uwbslam_jax import __version__
 COMMANDS = {
     "demo": "simulate a robot in a workshop, run the recording, and report",
     "run": "run a recording: track, beacons, map and report into a folder",
+    "tune": "find noise parameters, biases and the LiDAR's mounting from recordings",
     "live": "run on LiDAR and UWB devices, with a view in the browser",
     "simulate": "write a recording of a ready-made scenario, with ground truth",
     "evaluate": "compare a run's folder with ground truth",

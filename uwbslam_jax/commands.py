@@ -27,15 +27,17 @@ from uwbslam_jax.mcap_log import LogError, LogReader, LogWriter
 from uwbslam_jax.measurements import Message, ScanMessage, TruthMessage
 from uwbslam_jax.metrics import Truth, evaluate
 from uwbslam_jax.outputs import RunError, read_run
+from uwbslam_jax.rollout import RolloutError
 from uwbslam_jax.run import run_log
 from uwbslam_jax.simulate import SCENARIOS, Scenario, scenario, settings_overrides, simulate
+from uwbslam_jax.tune_command import TuneOptions, tune
 
 
 class UsageError(ValueError):
     """A request that cannot be met; the message is one line."""
 
 
-USER_ERRORS = (LogError, ConfigError, RunError, DriverError, UsageError, OSError)
+USER_ERRORS = (LogError, ConfigError, RunError, RolloutError, DriverError, UsageError, OSError)
 """What a user can mend; the command line tells these in one line. Anything else is a defect of ours."""
 
 
@@ -121,6 +123,9 @@ def call(name: str, words: Sequence[str]) -> None:
     if options is RunOptions:
         default = RunOptions(Path(), Path(), settings=_settings_file(words))
         default.log = default.out = tyro.MISSING  # these two have to be given all the same
+    elif options is TuneOptions:
+        default = TuneOptions((), Path(), settings=_settings_file(words))
+        default.logs = default.out = tyro.MISSING
     elif options is LiveOptions:
         default = LiveOptions(Path(), settings=_settings_file(words))
         default.out = tyro.MISSING
@@ -162,7 +167,7 @@ def simulate_scenario(options: SimulateOptions) -> None:
     made = _scenario(options.name, options.seed, options.duration)
     _record(made, options.out, options.quiet)
     print(f"recording: {options.out} ({made.duration:.1f} s)")
-    text = _differences(settings_file.from_dict(settings_overrides(made)))
+    text = settings_file.differences(settings_file.from_dict(settings_overrides(made)))
     if text:
         path = options.out.with_suffix(".toml")
         path.write_text(text, encoding="utf-8")
@@ -190,6 +195,7 @@ _COMMANDS: dict[str, tuple[Any, Callable[[Any], None]]] = {
     "simulate": (SimulateOptions, simulate_scenario),
     "evaluate": (EvaluateOptions, evaluate_run),
     "inspect": (InspectOptions, inspect_log),
+    "tune": (TuneOptions, tune),
     "live": (LiveOptions, live),
     "emulate": (EmulateOptions, emulate),
 }
@@ -231,22 +237,6 @@ def _record(made: Scenario, path: Path, quiet: bool) -> None:
         for message in simulate(made):
             writer.write(message)
             bar.update(isinstance(message, ScanMessage))
-
-
-def _differences(settings: Settings) -> str:
-    """TOML of what differs from the defaults, "" where nothing does."""
-    usual = dict(_sections(settings_file.dump(Settings())))
-    blocks = []
-    for head, lines in _sections(settings_file.dump(settings)):
-        if changed := [line for line in lines if line not in usual[head]]:
-            blocks.append("\n".join([head, *changed]) + "\n")
-    return "\n".join(blocks)
-
-
-def _sections(text: str) -> Iterator[tuple[str, list[str]]]:
-    for block in text.strip().split("\n\n"):
-        head, *lines = block.split("\n")
-        yield head, lines
 
 
 def _load_truth(path: Path) -> Truth:

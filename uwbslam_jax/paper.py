@@ -17,6 +17,7 @@ from uwbslam_jax.config import Params
 from uwbslam_jax.ekf import Gaussian
 from uwbslam_jax.geometry import gauge_pose, rotation
 from uwbslam_jax.grid import Grid, Sweep
+from uwbslam_jax.matching import Match
 from uwbslam_jax.measurements import Ranges
 from uwbslam_jax.objective import lidar_residual
 
@@ -132,6 +133,13 @@ def joint_match(
         )
         delta = matching.gauss_newton(joint_residual, delta, args, 5)
     return delta * free
+
+
+def log_likelihood(match: Match, params: Params, valid: Bool[Array, "B"]) -> Float[Array, ""]:
+    """Log density of a scan's residuals 1 - Gamma under N(0, sigma_l^2), for as many beams as count as independent."""
+    count = jnp.minimum(jnp.sum(valid), params.independent_beams)
+    square = ((1.0 - match.score) / params.sigma_l) ** 2
+    return -0.5 * count * (square + jnp.log(2 * jnp.pi * params.sigma_l**2))
 
 
 def correct(belief: Gaussian, delta: Float[Array, "d"]) -> Gaussian:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -22,6 +23,8 @@ _LEARN = 0.1
 """Logarithm by which a pair's scatter moves with one range, at most twice that apart: some 40 ranges for a factor 8."""
 _NORMAL_MEDIAN = 0.674
 _SCATTER_LIMITS = (-0.7, 2.5)
+_ASTRAY, _ASTRAY_M = 0.02, 20.0
+"""For the likelihood: so many ranges are anything within so many metres of what was expected."""
 _LOUDEST = 10.0
 """However much a pair scatters, its noise counts as this many times that of a quiet one at most."""
 
@@ -187,12 +190,13 @@ def update(
     normalised = innovation / jnp.sqrt(S)
     weight = jnp.where(usable, robust_weight(normalised) if robust else 1.0, 0.0)
     scaled = H * (weight / variance)[:, None]
-    log_likelihood = jnp.sum(jnp.where(usable, _log_density(normalised, S, robust), 0.0))
+    log_likelihood = jnp.sum(jnp.where(usable, log_density(innovation, S, robust), 0.0))
     after = ekf.update_information(belief, H.T @ scaled, scaled.T @ innovation)
     return after, RangeUpdate(innovation, normalised, weight, log_likelihood), scatter
 
 
-def _log_density(normalised, S, robust):
-    square = normalised**2
-    loss = square / (1.0 + square / _SOFT**2) if robust else square
-    return -0.5 * (loss + jnp.log(2 * jnp.pi * S))
+def log_density(innovation: Float[Array, "*m"], S: Float[Array, "*m"], robust: bool) -> Float[Array, "*m"]:
+    """Log density of innovations [1/m]. The robust one is a normal one for most ranges and an even one for the rest: it
+    integrates to one. What the weights belong to does not (their loss is bounded), and would have sigma_n go to 0."""
+    normal = -0.5 * (innovation**2 / S + jnp.log(2 * jnp.pi * S))
+    return jnp.logaddexp(normal + math.log1p(-_ASTRAY), math.log(_ASTRAY / _ASTRAY_M)) if robust else normal

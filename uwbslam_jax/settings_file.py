@@ -7,7 +7,7 @@ import difflib
 import json
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -86,6 +86,22 @@ def dump(settings: Settings) -> str:
         lines = [f"{key} = {_toml(getattr(values, key), hint)}" for key, hint in hints.items()]
         blocks.append("\n".join([f"[{section.name}]", *lines]))
     return "\n\n".join(blocks) + "\n"
+
+
+def differences(settings: Settings) -> str:
+    """TOML text of what differs from the defaults, "" where nothing does."""
+    usual = dict(_blocks(dump(Settings())))
+    blocks = []
+    for head, lines in _blocks(dump(settings)):
+        if changed := [line for line in lines if line not in usual[head]]:
+            blocks.append("\n".join([head, *changed]) + "\n")
+    return "\n".join(blocks)
+
+
+def _blocks(text: str) -> Iterator[tuple[str, list[str]]]:
+    for block in text.strip().split("\n\n"):
+        head, *lines = block.split("\n")
+        yield head, lines
 
 
 def check(settings: Settings) -> Settings:

@@ -241,6 +241,8 @@ def judge(sightings: Sightings, known: Known, slot: int, velocity: np.ndarray) -
     biased = as_it_is - misfit(here, at, distance - bias, sigma)
     spots = _moving_fits(rows, known, known.places[slot])
     best = [spot for spot in spots if spot.cost - spots[0].cost < DECIDED]
+    if not best:  # a state that is not finite any more, as the paper's own steps may end up with
+        return Verdict(True, None, rows, bias)
     spot = min(best, key=lambda s: float(np.linalg.norm(s.place - known.places[slot])))
     held = _unless_walled(as_it_is, off, rows) if rests else as_it_is
     moved = held - misfit(spot.place + time[:, None] * spot.velocity, at, distance, sigma)

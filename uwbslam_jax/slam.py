@@ -88,7 +88,7 @@ class Estimate(NamedTuple):
       score, known: of the match, see Match.
       poor, searched, drawn: what happened to the scan.
       innovation, normalised, weight: (M,) of the ranges.
-      log_likelihood: of the ranges.
+      log_likelihood: of the ranges; match_log_likelihood: of the match, 0 where there is no scan.
     """
 
     pose: Float[Array, "3"]
@@ -111,6 +111,7 @@ class Estimate(NamedTuple):
     normalised: Float[Array, "M"]
     weight: Float[Array, "M"]
     log_likelihood: Float[Array, ""]
+    match_log_likelihood: Float[Array, ""]
 
 
 def init(config: Config) -> State:
@@ -138,7 +139,8 @@ def init(config: Config) -> State:
 def step(config: Config, params: Params, state: State, frame: Frame) -> tuple[State, Estimate]:
     """One frame through the estimator.
 
-    Differentiable in params, state and frame except through its decisions (search, drawing, cells), which are held.
+    Differentiable in params, state and frame except through its decisions, which are held: cells, drawing, and the pose
+    that a search has found.
     """
     belief = _predict(config, params, state, frame)
     usable = _usable(config, state, frame)
@@ -170,9 +172,11 @@ def _usable(config, state, frame) -> Bool[Array, "M"]:
 
 
 class _Matched(NamedTuple):
-    """A match and what was made of it: the information it was given, whether it may be drawn, what it taught."""
+    """A match and what was made of it: how likely it was, the information it was given, whether it may be drawn, what
+    it taught."""
 
     match: Match
+    log_likelihood: Float[Array, ""]
     information: Float[Array, "3 3"]
     poor: Bool[Array, ""]
     searched: Bool[Array, ""]
@@ -186,6 +190,8 @@ def _match_and_fuse(config, params, state, belief, frame, sweep, surface, usable
     match, searched = _match(config, params, state, belief, sweep, surface, frame.has_scan)
     seen = jnp.where(frame.has_scan & _map_errs(config, state), _epoch_seen(config, state.grid, sweep, match.pose), 0.0)
     belief, spread = trust.revisit(belief, state.map_spread, seen, params)
+    # before the belief is widened for this very match
+    likelihood = jnp.where(frame.has_scan, trust.log_likelihood(match, belief, params, jnp.sum(sweep.valid)), 0.0)
     lost = (match.known > _KNOWN_ENOUGH) & (match.score < _LOST_SCORE)
     lost = lost | (searched & (match.known < _FOUND_KNOWN))
     sure = trust.is_sure(match) & frame.has_scan
@@ -204,7 +210,7 @@ def _match_and_fuse(config, params, state, belief, frame, sweep, surface, usable
     expected = trust.expected_match(belief)
     place = expected[:2] + match.informed @ (match.pose[:2] - expected[:2])
     match = match._replace(pose=match.pose.at[:2].set(place))
-    return belief, _Matched(match, information, poor & frame.has_scan, searched, trusted, unrest, spread)
+    return belief, _Matched(match, likelihood, information, poor & frame.has_scan, searched, trusted, unrest, spread)
 
 
 def _expected_fit(config, state, belief, sweep) -> Float[Array, ""]:
@@ -224,7 +230,9 @@ def _joint_match(config, params, state, belief, frame, sweep, surface, usable) -
     pose = layout.robot_pose(corrected.mean)
     match = matching.assess(state.grid, sweep, surface, pose, config.resolution)
     no = jnp.zeros((), bool)
-    matched = _Matched(match, jnp.zeros((3, 3)), no, no, frame.has_scan, state.unrest, state.map_spread)
+    likelihood = paper.log_likelihood(match, params, sweep.valid)
+    likelihood = jnp.where(frame.has_scan, likelihood, 0.0)
+    matched = _Matched(match, likelihood, jnp.zeros((3, 3)), no, no, frame.has_scan, state.unrest, state.map_spread)
     return corrected if config.correction else belief, matched
 
 
@@ -269,6 +277,7 @@ def _match(config, params, state, belief, sweep, surface, has_scan) -> tuple[Mat
         found = matching.search(
             state.grid, sweep, surface, likely, (last, match.pose), params.sigma_l, config.resolution
         )
+        found = lax.stop_gradient(found)  # a choice among places
         return matching.assess(state.grid, sweep, surface, found, config.resolution)
 
     return lax.cond(wanted, wide, lambda _: match, None), wanted
@@ -350,4 +359,5 @@ def _report(state, matched: _Matched, used, drawn) -> Estimate:
         normalised=used.normalised,
         weight=used.weight,
         log_likelihood=used.log_likelihood,
+        match_log_likelihood=matched.log_likelihood,
     )

@@ -73,7 +73,7 @@ def solve(
       height, bias: (K,) of the slots, as configured [m]. bias_scale: share of a range that is bias [m/m].
       biased: whether biases were found before.
     """
-    problem = _Problem.build(graph, poses, places, height, bias, bias_scale)
+    problem = Problem.build(graph, poses, places, height, bias, bias_scale)
     if problem is None:
         return None
     x = problem.start(poses, places)
@@ -84,7 +84,7 @@ def solve(
 
 
 @dataclass(frozen=True)
-class _Problem:
+class Problem:
     """The run in arrays. N keyframes, B resting places, S slots (the robot's first) with a bias each.
 
     edges: old, new (E,), between (E, 3), roots (E, 3, 3), soft (E,) whether it may be an outlier.
@@ -114,7 +114,7 @@ class _Problem:
     pair_numbers: np.ndarray
 
     @staticmethod
-    def build(graph: Graph, poses, places, height, bias, bias_scale) -> _Problem | None:
+    def build(graph: Graph, poses, places, height, bias, bias_scale) -> Problem | None:
         heard: dict[Node, int] = {}
         for mean in graph.ranges.means:
             heard[mean.node] = heard.get(mean.node, 0) + 1
@@ -141,7 +141,7 @@ class _Problem:
                 s = mean_sigma(0.64 * len(values), scatter, graph.ranges.sigma_n)
                 pairs.append((index[a], index[b], d, height[a[0]] - height[b[0]], s))
         old, new, between, roots, soft = steps(graph, poses)
-        return _Problem(
+        return Problem(
             len(graph.keyframes),
             nodes,
             slots,
@@ -176,7 +176,8 @@ class _Problem:
         beacons = np.array([places[node] for node in self.nodes])
         return np.concatenate([poses.ravel(), beacons.ravel(), np.zeros(len(self.slots))])
 
-    def _bias_column(self, nodes: np.ndarray) -> np.ndarray:
+    def bias_column(self, nodes: np.ndarray) -> np.ndarray:
+        """Columns of the biases of resting places (n,)."""
         slots = np.array([self.slots.index(slot) for slot, _ in self.nodes])
         return self._first_bias + slots[nodes]
 
@@ -235,7 +236,7 @@ class _Problem:
         self._edge_rows(rows, poses, stage[0])
         self._steady_rows(rows, poses)
         self._range_rows(rows, x, poses, stage[1])
-        self._pair_rows(rows, x, stage[1])
+        self.add_pairs(rows, x, stage[1])
         m = self._first_bias
         rows.add(x[m:] / bias_sigma, [(np.arange(m, self.size), np.full(len(self.slots), 1 / bias_sigma))])
         return rows.matrix(), rows.residuals()
@@ -291,7 +292,7 @@ class _Problem:
         antenna = (1 - self.share)[:, None] * ends[0] + self.share[:, None] * ends[1]
         u = antenna - beacons[self.to]
         d = np.maximum(np.sqrt((u**2).sum(1) + self.rise**2), 1e-6)
-        column = self._bias_column(self.to)
+        column = self.bias_column(self.to)
         robot = self._first_bias
         sigma = coarse * self.sigma
         r, scale = soften((d + x[robot] + x[column] - self.distance) / sigma)
@@ -306,7 +307,8 @@ class _Problem:
         parts += [(np.full(len(d), robot), weight), (column, weight)]
         rows.add(r, parts)
 
-    def _pair_rows(self, rows: Rows, x, coarse: float) -> None:
+    def add_pairs(self, rows: Rows, x: np.ndarray, coarse: float = 1.0) -> None:
+        """Rows of the ranges between beacons; coarse: how many times as much they may err."""
         if not len(self.pair):
             return
         n = 3 * self.count
@@ -316,7 +318,7 @@ class _Problem:
         sigma = coarse * sigma
         u = beacons[i] - beacons[j]
         d = np.maximum(np.sqrt((u**2).sum(1) + rise**2), 1e-6)
-        first, second = self._bias_column(i), self._bias_column(j)
+        first, second = self.bias_column(i), self.bias_column(j)
         r, scale = soften((d + x[first] + x[second] - distance) / sigma)
         weight = scale / sigma
         parts = []

@@ -7,9 +7,11 @@ pose gets uncertain enough to follow, unless the ranges speak against it. How of
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
+from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
 from uwbslam_jax import layout, ranging
@@ -45,6 +47,10 @@ _OTHER_EPOCH = 3.0
 """Ground drawn within so much way of each other errs alike [m]."""
 _PATCH_M = 8.0
 """Ground so far apart on the way errs each by itself where scans say little of how it hangs together [m]."""
+_ASTRAY = 0.02
+"""For the likelihood: so many matches are anywhere in the cube of _ANYWHERE around what was expected."""
+_ANYWHERE = 1.0
+"""A match is taken to err by this at most where its scan tells nothing [m, rad]."""
 _SHORTEST_S = 0.05
 """A jump is taken to have lasted at least so long [s]."""
 
@@ -99,14 +105,33 @@ def weigh(
     (Y^-1 + floor)^-1. The surprise is the squared Mahalanobis distance to what was expected; information falls with
     it as with a range's (Geman-McClure), so that a plausible match of the wrong place cannot drag the state.
     """
-    share = params.independent_beams / jnp.maximum(beams, params.independent_beams)
-    Y = match.information * (share / params.sigma_l**2)
-    floor = jnp.diag(jnp.array(_MATCH_FLOOR) ** 2)
-    Y = jnp.linalg.solve(jnp.eye(3) + Y @ floor, Y)
+    Y = _information(match, params, beams)
     innovation, S = _innovation(match, belief)
     # nu^T (S + Y^-1)^-1 nu without the inverse of a Y that may be singular
     surprise = innovation @ jnp.linalg.solve(jnp.eye(3) + Y @ S, Y @ innovation)
     return surprise, Y / (1.0 + surprise / SURPRISE) ** 2
+
+
+def log_likelihood(match: Match, belief: Gaussian, params: Params, beams: Int[Array, ""]) -> Float[Array, ""]:
+    """Log density of a match given what was expected of it [1/m^2/rad].
+
+    A normal one of covariance S + Y^-1 for most matches and an even one for those that found the wrong place, so that
+    it integrates to one whatever the parameters are.
+    """
+    blind = jnp.eye(3) / _ANYWHERE**2
+    innovation, S = _innovation(match, belief)
+    L = jnp.linalg.cholesky(S + jnp.linalg.inv(_information(match, params, beams) + blind))
+    half = solve_triangular(L, innovation, lower=True)
+    normal = -0.5 * (half @ half) - jnp.sum(jnp.log(jnp.diagonal(L))) - 1.5 * math.log(2 * math.pi)
+    return jnp.logaddexp(normal + math.log1p(-_ASTRAY), math.log(_ASTRAY / _ANYWHERE**3))
+
+
+def _information(match: Match, params: Params, beams: Int[Array, ""]) -> Float[Array, "3 3"]:
+    """Y of a match: its Hessian for as many beams as count as independent, and never better than the floor."""
+    share = params.independent_beams / jnp.maximum(beams, params.independent_beams)
+    Y = match.information * (share / params.sigma_l**2)
+    floor = jnp.diag(jnp.array(_MATCH_FLOOR) ** 2)
+    return jnp.linalg.solve(jnp.eye(3) + Y @ floor, Y)
 
 
 def fuse(belief: Gaussian, match: Match, information: Float[Array, "3 3"]) -> Gaussian:
