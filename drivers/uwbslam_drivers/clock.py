@@ -22,8 +22,8 @@ MOST_DRIFT = 1e-3
 SOONER = 0.2
 """A device time this far ahead of the envelope is impossible [s]."""
 EARLY = 5e-3
-"""One this far ahead of it [s] may be a damaged number that its sum did not show, and moves nothing; as many as AGREEING
-in a row are the end of a delay."""
+"""One this far ahead of it [s] may be a damaged number that its sum did not show, and moves nothing; as many as
+AGREEING in a row are the end of a delay."""
 LATER = 5.0
 """Data does not wait longer than this [s]."""
 AGREEING = 3
