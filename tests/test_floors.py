@@ -15,7 +15,7 @@ FLOORS: dict[float, str] = {
     0: "__init__",
     1: "geometry measurements config ekf result layout mcap_records packing paths rays sparse_rows",
     2: "motion ranging grid metrics settings_file frames ros_types worlds multilateration inbox",
-    2.05: "keyframes",
+    2.05: "keyframes bag",
     2.1: "sightings placement relative schemas result_log conditions",
     2.2: "mcap_log scenarios hypotheses",
     2.3: "log_summary",

@@ -249,8 +249,57 @@ class TestBrokenFiles:
         write_log(tmp_path / "bag_0.mcap", log_messages(2))
         assert_same(list(LogReader(tmp_path)), log_messages(2))
         write_log(tmp_path / "bag_1.mcap", log_messages(2))
-        with pytest.raises(LogError, match=r"bag_0\.mcap, bag_1\.mcap"):
+        with pytest.raises(LogError, match=r"name those that are: bag_0\.mcap, bag_1\.mcap"):
             LogReader(tmp_path)
+        assert_same(list(LogReader([tmp_path / "bag_1.mcap"])), log_messages(2))
+
+    @pytest.fixture
+    def split(self, tmp_path: Path) -> Path:
+        """A bag of two files, of which the first one ends later than the second one begins."""
+        messages = log_messages(20)
+        write_log(tmp_path / "bag_0.mcap", [*messages[:10], messages[12]])
+        write_log(tmp_path / "bag_1.mcap", [*messages[10:12], *messages[13:]])
+        (tmp_path / "whole").mkdir()
+        write_log(tmp_path / "whole" / "a.mcap", messages)
+        (tmp_path / "metadata.yaml").write_text(
+            "rosbag2_bagfile_information:\n  version: 9\n  storage_identifier: mcap\n"
+            "  relative_file_paths:\n    - bag_0.mcap\n    - bag_1.mcap\n"
+        )
+        return tmp_path
+
+    def test_a_bag_of_several_files_is_one_recording(self, split: Path) -> None:
+        files = [split / "bag_0.mcap", split / "bag_1.mcap"]
+        one = LogReader(split / "whole")
+        for source in (split, files):
+            reader = LogReader(source)
+            assert_same(list(reader), list(one))
+            assert (reader.message_count, reader.duration) == (one.message_count, one.duration)
+            assert reader.truncated is None
+        assert LogReader(files).name == f"{files[0]} and 1 more"
+        told, whole = log_summary.inspect(split), log_summary.inspect(split / "whole")
+        assert [(t.name, t.role, t.count) for t in told.topics] == [(t.name, t.role, t.count) for t in whole.topics]
+
+    def test_a_bag_whose_first_file_breaks_goes_on_with_the_second(self, split: Path) -> None:
+        first, second = split / "bag_0.mcap", split / "bag_1.mcap"
+        first.write_bytes(first.read_bytes()[: first.stat().st_size * 2 // 3])
+        reader = LogReader(split)
+        assert str(reader.truncated).startswith("bag_0.mcap: recording breaks after ")
+        assert {m.stamp for m in LogReader(second)} <= {m.stamp for m in reader}
+
+    @pytest.mark.parametrize(
+        ("metadata", "told"),
+        [
+            ("{relative_file_paths: [a.db3]}", r"a bag of \.db3 files: convert it"),
+            ("{relative_file_paths: [bag_0.mcap, c.mcap]}", r"not there: c\.mcap"),
+            ("[", r"metadata\.yaml: "),
+            ("3", r"metadata\.yaml: "),
+        ],
+    )
+    def test_bags_that_cannot_be_read(self, split: Path, metadata: str, told: str) -> None:
+        (split / "metadata.yaml").write_text(f"rosbag2_bagfile_information: {metadata}\n")
+        with pytest.raises(LogError, match=told) as error:
+            LogReader(split)
+        assert "\n" not in str(error.value)
 
     def test_no_messages_at_all(self, tmp_path: Path) -> None:
         with pytest.raises(LogError, match="there are no topics"):

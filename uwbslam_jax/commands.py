@@ -45,8 +45,8 @@ USER_ERRORS = (LogError, ConfigError, RunError, RolloutError, DriverError, Usage
 class RunOptions:
     """Run a recording; its track, beacons, map, summary and report go into a folder."""
 
-    log: Positional[Path]
-    """MCAP recording, or a ROS 2 bag folder with one."""
+    logs: Positional[tuple[Path, ...]]
+    """MCAP recording, or a ROS 2 bag folder; several MCAP files are one recording."""
     out: Annotated[Path, arg(aliases=["-o"])]
     """Folder for the files; it is created."""
     config: Path | None = None
@@ -106,8 +106,8 @@ class EvaluateOptions:
 class InspectOptions:
     """Tell what a recording holds: topics, rates, gaps, nodes heard, and what is missing."""
 
-    log: Positional[Path]
-    """MCAP recording, or a ROS 2 bag folder with one."""
+    logs: Positional[tuple[Path, ...]]
+    """MCAP recording, or a ROS 2 bag folder; several MCAP files are one recording."""
     config: Path | None = None
     """Settings in TOML, for the topics and the robot's id."""
 
@@ -121,8 +121,8 @@ def call(name: str, words: Sequence[str]) -> None:
     options, run = _COMMANDS[name]
     default = None
     if options is RunOptions:
-        default = RunOptions(Path(), Path(), settings=_settings_file(words))
-        default.log = default.out = tyro.MISSING  # these two have to be given all the same
+        default = RunOptions((), Path(), settings=_settings_file(words))
+        default.logs = default.out = tyro.MISSING  # these two have to be given all the same
     elif options is TuneOptions:
         default = TuneOptions((), Path(), settings=_settings_file(words))
         default.logs = default.out = tyro.MISSING
@@ -149,7 +149,7 @@ def run(options: RunOptions) -> None:
         settings = dataclasses.replace(settings, odom=dataclasses.replace(settings.odom, use=False))
     if options.lidar_only:
         settings = dataclasses.replace(settings, filter=dataclasses.replace(settings.filter, lidar_only=True))
-    _run_and_write(options.log, settings_file.check(settings), options.out, quiet=options.quiet, online=options.online)
+    _run_and_write(options.logs, settings_file.check(settings), options.out, quiet=options.quiet, online=options.online)
 
 
 def demo(options: DemoOptions) -> None:
@@ -159,7 +159,7 @@ def demo(options: DemoOptions) -> None:
     log = options.out / "demo.mcap"
     _record(made, log, options.quiet)
     settings = settings_file.from_dict(settings_overrides(made))
-    _run_and_write(log, settings, options.out, quiet=options.quiet, title="UWB and LiDAR SLAM demo")
+    _run_and_write((log,), settings, options.out, quiet=options.quiet, title="UWB and LiDAR SLAM demo")
 
 
 def simulate_scenario(options: SimulateOptions) -> None:
@@ -186,7 +186,7 @@ def inspect_log(options: InspectOptions) -> None:
     """The command `inspect`."""
     s = settings_file.load(options.config) if options.config else Settings()
     topics = {"scan_topic": s.lidar.topic, "uwb_topic": s.uwb.topic, "odom_topic": s.odom.topic}
-    print(format_summary(inspect(options.log, **topics, robot_id=s.robot.id, max_range=s.uwb.max_range)))
+    print(format_summary(inspect(options.logs, **topics, robot_id=s.robot.id, max_range=s.uwb.max_range)))
 
 
 _COMMANDS: dict[str, tuple[Any, Callable[[Any], None]]] = {
@@ -205,7 +205,13 @@ _COMMANDS: dict[str, tuple[Any, Callable[[Any], None]]] = {
 
 
 def _run_and_write(
-    log: Path, settings: Settings, out: Path, *, quiet: bool, online: bool = False, title: str | None = None
+    logs: tuple[Path, ...],
+    settings: Settings,
+    out: Path,
+    *,
+    quiet: bool,
+    online: bool = False,
+    title: str | None = None,
 ) -> None:
     """Runs a recording, writes every file of the run and prints its figures."""
     out.mkdir(parents=True, exist_ok=True)  # before the long work, not after it
@@ -215,8 +221,8 @@ def _run_and_write(
             bar.total = total
             bar.update(done - bar.n)
 
-        result, truth = run_log(log, settings, online=online, progress=progress)
-    deliver(result, truth, out, title or f"UWB and LiDAR SLAM: {log.name}")
+        result, truth = run_log(logs, settings, online=online, progress=progress)
+    deliver(result, truth, out, title or f"UWB and LiDAR SLAM: {', '.join(log.name for log in logs)}")
 
 
 def _scenario(name: str, seed: int, duration: float | None) -> Scenario:

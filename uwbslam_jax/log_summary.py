@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass, field
-from pathlib import Path
 
+from uwbslam_jax.bag import Bag, Source
 from uwbslam_jax.mcap_log import choose_topics
-from uwbslam_jax.mcap_records import LogError, Recording
+from uwbslam_jax.mcap_records import LogError
 from uwbslam_jax.measurements import Message, RangeMessage, ScanMessage
 from uwbslam_jax.schemas import Decoder, Options, Role
 
@@ -38,7 +38,7 @@ class LogSummary:
     """What a recording holds.
 
     Attributes:
-      path: the file.
+      name: what it is called.
       duration: from its first to its last message [s].
       topics: every topic, by name.
       ids: exchanges each node took part in, by id.
@@ -51,7 +51,7 @@ class LogSummary:
       truncated: where it breaks, None where it does not.
     """
 
-    path: Path
+    name: str
     duration: float
     topics: list[TopicSummary]
     ids: dict[int, int]
@@ -66,7 +66,7 @@ class LogSummary:
 
 
 def inspect(
-    path: str | Path,
+    source: Source,
     *,
     scan_topic: str | None = "/scan",
     uwb_topic: str | None = "/uwb/ranges",
@@ -79,7 +79,7 @@ def inspect(
     Raises:
       LogError: the file cannot be read at all. Missing or ambiguous topics are `problems` of the summary.
     """
-    recording, options = Recording(path), Options(robot_id, max_range)
+    recording, options = Bag(source), Options(robot_id, max_range)
     decoders: dict[int, Decoder] = {}
     roles: dict[int, Role] = {}
     problems: list[str] = []
@@ -102,7 +102,7 @@ def inspect(
         if number in decoders:
             heard.take(decoders[number](data, log_time))
     return LogSummary(
-        path=recording.path,
+        name=recording.name,
         duration=(recording.end - recording.start) * 1e-9,
         topics=_topics(recording, clocks, roles),
         ids=dict(sorted(heard.ids.items())),
@@ -151,7 +151,7 @@ class _Heard:
                 self.beams = max(self.beams, message.ranges.size)
 
 
-def _topics(recording: Recording, clocks: dict[str, _Clock], roles: dict[int, Role]) -> list[TopicSummary]:
+def _topics(recording: Bag, clocks: dict[str, _Clock], roles: dict[int, Role]) -> list[TopicSummary]:
     by_name = {channel.topic: channel for channel in recording.channels.values()}
     role_of = {recording.channels[number].topic: role for number, role in roles.items()}
     summaries = []
@@ -165,7 +165,7 @@ def _topics(recording: Recording, clocks: dict[str, _Clock], roles: dict[int, Ro
 
 def format_summary(summary: LogSummary) -> str:
     """The summary as text of several lines, units in the column heads."""
-    lines = [f"{summary.path}: {summary.duration:.1f} s"]
+    lines = [f"{summary.name}: {summary.duration:.1f} s"]
     rows = [("topic", "role", "messages", "rate [Hz]", "largest gap [s]", "type")]
     for topic in summary.topics:
         rate, gap = ("-" if math.isnan(v) else f"{v:.2f}" for v in (topic.rate, topic.largest_gap))

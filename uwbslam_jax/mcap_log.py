@@ -12,7 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 
-from uwbslam_jax.mcap_records import Channel, Recording, RecordWriter
+from uwbslam_jax.bag import Bag, Source
+from uwbslam_jax.mcap_records import Channel, RecordWriter
 from uwbslam_jax.mcap_records import LogError as LogError
 from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, ScanMessage, TruthMessage
 from uwbslam_jax.ros_types import definition, encode
@@ -27,7 +28,7 @@ class LogReader:
     """Iterates over the measurements of a recording by log time, streaming; may be iterated again.
 
     Attributes:
-      path: the MCAP file read.
+      name: what messages call it.
       topics: topic -> role ("scan", "uwb", "odom", "truth") of the topics used.
       warnings: what a user should know before the run, one line each.
       dropped: messages left out so far, by reason; of the current iteration.
@@ -38,7 +39,7 @@ class LogReader:
 
     def __init__(
         self,
-        path: str | Path,
+        source: Source,
         *,
         scan_topic: str | None = "/scan",
         uwb_topic: str | None = "/uwb/ranges",
@@ -49,7 +50,7 @@ class LogReader:
         """Opens a recording and chooses its topics: those named, else the only one of a fitting type.
 
         Args:
-          path: an MCAP file, or a ROS 2 bag folder with one.
+          source: an MCAP file, a ROS 2 bag folder, or several that belong together.
           scan_topic, uwb_topic, odom_topic: where to look first; None leaves that sensor out.
           robot_id: id of the robot's node, for range messages that name only the other one.
           max_range: longer ranges are dropped and counted [m].
@@ -58,9 +59,9 @@ class LogReader:
           LogError: the file cannot be read, has neither scans nor odometry nor ranges, leaves a choice open, or a named
             topic holds something else.
         """
-        self._recording = Recording(path)
+        self._recording = Bag(source)
         self._options = Options(robot_id, max_range)
-        self.path = self._recording.path
+        self.name = self._recording.name
         wanted: dict[Role, str | None] = {"scan": scan_topic, "uwb": uwb_topic, "odom": odom_topic}
         try:
             self._decoders, self._roles = choose_topics(self._recording, wanted, self._options)
@@ -69,7 +70,7 @@ class LogReader:
                 raise LogError(f"no scan topic ({wanted_scan}), no odometry and no ranges; {_listing(self._recording)}")
         except LogError as error:
             broken = f"; {self._recording.truncated}" if self._recording.truncated else ""
-            raise LogError(f"{self.path}: {' '.join(str(error).split())}{broken}") from None
+            raise LogError(f"{self.name}: {' '.join(str(error).split())}{broken}") from None
         channels = self._recording.channels
         self.topics: dict[str, Role] = {channels[number].topic: role for number, role in self._roles.items()}
         self.warnings: list[str] = []
@@ -94,7 +95,7 @@ class LogReader:
 
 
 def choose_topics(
-    recording: Recording, wanted: dict[Role, str | None], options: Options
+    recording: Bag, wanted: dict[Role, str | None], options: Options
 ) -> tuple[dict[int, Decoder], dict[int, Role]]:
     """Decoders and roles by channel number: of the topic wanted for each role, else of the only one that fits.
 
@@ -119,7 +120,7 @@ def choose_topics(
     return decoders, roles
 
 
-def _discover(recording: Recording, role: Role, options: Options) -> dict[int, Decoder]:
+def _discover(recording: Bag, role: Role, options: Options) -> dict[int, Decoder]:
     """The channels of the only topic whose type fits the role; empty where none does. Raises LogError for several."""
     found: dict[int, Decoder] = {}
     for channel in recording.channels.values():
@@ -155,7 +156,7 @@ def _truth_decoder(channel: Channel, options: Options) -> Decoder | None:
     return decode_beacon
 
 
-def _listing(recording: Recording) -> str:
+def _listing(recording: Bag) -> str:
     topics = sorted({f"{channel.topic} ({channel.schema})" for channel in recording.channels.values()})
     return f"the topics are {', '.join(topics)}" if topics else "there are no topics"
 

@@ -83,21 +83,6 @@ class _Block(NamedTuple):
     whole: bool  # False where the file ends inside
 
 
-def find_file(path: str | Path) -> Path:
-    """The MCAP file meant by a path: itself, or the one inside a ROS 2 bag folder. Raises LogError."""
-    path = Path(path)
-    if not path.exists():
-        raise LogError(f"{path}: no such file")
-    if not path.is_dir():
-        return path
-    files = sorted(path.glob("*.mcap"))
-    if len(files) == 1:
-        return files[0]
-    if files:
-        raise LogError(f"{path}: {len(files)} .mcap files in this folder, name one: {', '.join(f.name for f in files)}")
-    raise LogError(f"{path}: a folder without a .mcap file")
-
-
 class Recording:
     """An MCAP file opened for reading.
 
@@ -113,9 +98,9 @@ class Recording:
         """Walks the record headers; decompresses only where the file has no summary.
 
         Raises:
-          LogError: no such file, not an MCAP, empty, or not readable.
+          LogError: not an MCAP, empty, or not readable.
         """
-        self.path = find_file(path)
+        self.path = Path(path)
         self.channels: dict[int, Channel] = {}
         self.counts: Counter[int] = Counter()
         self.truncated: str | None = None

@@ -9,12 +9,12 @@ import dataclasses
 import itertools
 import time
 from collections.abc import Callable, Iterable
-from pathlib import Path
 from types import TracebackType
 
 import jax
 
 from uwbslam_jax import relative
+from uwbslam_jax.bag import Source
 from uwbslam_jax.config import Settings
 from uwbslam_jax.findings import Facts, to_result
 from uwbslam_jax.frames import FrameAssembler
@@ -142,7 +142,7 @@ class Runner:
 
 
 def run_log(
-    path: str | Path,
+    source: Source,
     settings: Settings,
     *,
     online: bool = False,
@@ -151,7 +151,7 @@ def run_log(
     """Runs a recording.
 
     Args:
-      path: an MCAP file, or a ROS 2 bag folder with one.
+      source: an MCAP file, a ROS 2 bag folder, or several that belong together.
       online: step frame by frame, as on the robot; the result is the same.
       progress: called now and then with the number of messages read and of all.
 
@@ -164,7 +164,7 @@ def run_log(
     """
     begin = time.perf_counter()
     reader = LogReader(
-        path,
+        source,
         scan_topic=settings.lidar.topic,
         uwb_topic=None if settings.filter.lidar_only else settings.uwb.topic,
         odom_topic=settings.odom.topic if settings.odom.use else None,
@@ -187,7 +187,7 @@ def run_log(
     if not len(result.stamps) and not result.beacons:
         why = f"; {reader.truncated}" if reader.truncated else ""
         raise LogError(
-            f"{reader.path}: no usable scan on {settings.lidar.topic}, no odometry on {settings.odom.topic}, and no "
+            f"{reader.name}: no usable scan on {settings.lidar.topic}, no odometry on {settings.odom.topic}, and no "
             f"ranges that fix a geometry on {settings.uwb.topic}{why}"
         )
     if progress is not None:
