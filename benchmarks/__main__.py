@@ -25,8 +25,9 @@ NAMES = {
     "bound": "errors beside the Cramer-Rao bound, 50 runs",
     "tuning": "tuned noises, biases and mounting beside the truth, and what the gradient costs (an hour)",
     "gamma": "preset paper: error against gamma by features and ranges",
+    "paper": "every table and figure of the paper in simulation (20 minutes)",
 }
-_OTHERS = ("bound", "tuning", "gamma")
+_OTHERS = ("bound", "tuning", "gamma", "paper")
 """Not about speed: their modules are called as they are."""
 
 
