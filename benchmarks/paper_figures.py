@@ -11,6 +11,7 @@ import numpy as np
 from benchmarks import paper_cases as cases
 from benchmarks.paper_cases import Case, Seen
 from uwbslam_jax.outputs import trinary
+from uwbslam_jax.pictures import show_map, show_track
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -31,23 +32,9 @@ def draw(runs: Sequence[Case]) -> None:
 
 def _map(axes: Axes, run: Seen, title: str, beacons: bool = True) -> None:
     """Map, published track and the beacons' last places."""
-    rows, columns = run.map.log_odds.shape
-    x, y = run.map.origin
-    extent = (x, x + columns * run.map.resolution, y, y + rows * run.map.resolution)
-    axes.imshow(trinary(run.map.log_odds), origin="lower", cmap="gray", vmin=0, vmax=255, extent=extent)
-    axes.plot(run.poses[:, 0], run.poses[:, 1], color="tab:blue", lw=0.8)
-    axes.plot(*run.poses[-1, :2], "+", color="tab:green", ms=10, mew=2)
-    if beacons:
-        for node, track in run.beacons.items():
-            axes.plot(*track[-1], "^", color="tab:red", ms=6)
-            axes.annotate(str(node), track[-1], (4, 4), textcoords="offset points", color="tab:red", fontsize=8)
-    seen = np.argwhere(run.map.log_odds != 0)
-    if len(seen):
-        (r0, c0), (r1, c1) = seen.min(0), seen.max(0) + 1
-        size = run.map.resolution
-        axes.set(xlim=(x + c0 * size, x + c1 * size), ylim=(y + r0 * size, y + r1 * size))
+    show_map(axes, run.map)
+    show_track(axes, run.poses, {node: track[-1] for node, track in run.beacons.items()} if beacons else {})
     axes.set_title(title, fontsize=9)
-    axes.set_aspect("equal")
     axes.tick_params(labelsize=7)
 
 

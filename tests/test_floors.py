@@ -40,6 +40,7 @@ FLOORS: dict[float, str] = {
     7.5: "tune_pictures",
     7.6: "tune_command",
     8: "simulate report outputs recorder live_page publish",
+    8.05: "pictures",
     8.1: "saved_state live_view rehearsal deliver",
     8.2: "live",
     8.3: "live_command",
