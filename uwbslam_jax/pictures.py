@@ -55,7 +55,7 @@ def lidar_surface(
     resolution: float,
     level: int = 0,
 ) -> Float[np.ndarray, "n n"]:
-    """LiDAR term of the paper's eq. (opt), half the sum of (1 - Gamma)^2, on a level of the pyramid, with the pose moved
+    """LiDAR term of the paper's eq. (opt), half the sum of (1 - Gamma)^2, on a level of the pyramid, the pose moved
     by offsets in y (rows) and x (columns) [m]."""
 
     def term(dx, dy):
