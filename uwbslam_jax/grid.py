@@ -178,7 +178,7 @@ def _integrate_level(level, origin, size, ends, sensor, yaw, sweep):
     distance = _shifted(distance, shift)
     # a sensor outside the window is beyond the shifted tables: it frees nothing
     free = _passed(bearing, distance, yaw, size, sweep) & jnp.all((middle >= 0) & (middle <= cells))
-    block = jnp.where(free, jnp.maximum(block + FREE, CLAMP[0]), block)
+    block = jnp.where(free, jnp.maximum(block + FREE, CLAMP[0]), block) + 0.0 * struck[0]
     freed = lax.dynamic_update_slice(level, block, (start[1], start[0]))
     row, col = jnp.where(inside, cell[:, 1], cells), jnp.where(inside, cell[:, 0], cells)
     # many beams in one cell write the same value: once hit is once hit
