@@ -1,11 +1,12 @@
 """The state corrected by the run so far, while the run goes on: solved and drawn beside it, taken over when it is news.
 
-A revision is begun at one look of the host and taken over a fixed number of looks later, whether it was ready long
-before or has to be waited for: so a run and its re-run stay the same to the bit.
+A revision is solved, drawn where it is news, and taken over at fixed numbers of looks of the host, whether it was ready
+long before or has to be waited for: so a run and its re-run stay the same to the bit.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -26,8 +27,8 @@ from uwbslam_jax.smoothing import Solution
 from uwbslam_jax.startup import anchored, compose
 from uwbslam_jax.tiles import Tiles
 
-_LOOKS = 10
-"""Looks of the host from the beginning of a revision to its taking over."""
+_LOOKS = 5
+"""Looks of the host that the solution may take, and as many that the drawing may."""
 _GROWTH = 1.25
 """A revision is begun when the graph has grown by so much since the last one."""
 _FEWEST = 24
@@ -51,23 +52,32 @@ class Revision(NamedTuple):
     tiles: Tiles
 
 
-def revise(config: Config, params: Params, question: Question, resolution: float, epoch: float) -> Revision | None:
-    """Solves and draws. epoch: of the ground that is drawn, see grid [m]."""
-    solution = framed_solution(question)
-    if solution is None:
-        return None
-    tiles = Tiles(resolution)
-    seen = question.graph.seen(solution.poses)
-    grid = redraw(config, params, tiles, seen, solution.poses[-1, :2], epoch)
-    return Revision(question.graph.keyframes, solution, grid, tiles)
+@dataclass(frozen=True)
+class _Job:
+    """What a revision is made from. epoch: of the ground that is drawn, see grid [m]."""
+
+    config: Config
+    params: Params
+    question: Question
+    resolution: float
+    epoch: float
+
+    def draw(self, solution: Solution) -> Revision:
+        """The map, with the scans where the solution has them."""
+        tiles, graph = Tiles(self.resolution), self.question.graph
+        seen = graph.seen(solution.poses)
+        grid = redraw(self.config, self.params, tiles, seen, solution.poses[-1, :2], self.epoch)
+        return Revision(graph.keyframes, solution, grid, tiles)
 
 
 @dataclass
 class Reviser:
-    """Begins revisions and hands them over when they are due."""
+    """Begins revisions and hands them over when they are due. solved: how many were."""
 
+    solved: int = 0
     _pool: ThreadPoolExecutor | None = None
-    _running: Future[Revision | None] | None = None
+    _job: _Job | None = None
+    _running: Future[Solution | None] | Future[Revision] | None = None
     _due: int = 0
     _begun_with: int = 0
 
@@ -76,20 +86,29 @@ class Reviser:
         return self._running is None and keyframes >= max(_FEWEST, _GROWTH * self._begun_with)
 
     def begin(self, config: Config, params: Params, question: Question, resolution: float, epoch: float) -> None:
-        """Begins one from what was collected so far."""
+        """Begins one from what was collected so far. epoch: of the ground that is drawn, see grid [m]."""
         self._pool = self._pool or ThreadPoolExecutor(1, thread_name_prefix="revision")
+        self._job = _Job(config, params, question, resolution, epoch)
         self._begun_with, self._due = len(question.graph.keyframes), _LOOKS
-        self._running = self._pool.submit(revise, config, params, question, resolution, epoch)
+        self._running = self._pool.submit(framed_solution, question)
 
-    def look(self) -> Revision | None:
-        """The revision that is due at this look of the host; waited for if need be."""
-        if self._running is None:
+    def look(self, news: Callable[[list[Keyframe], Solution], bool]) -> Revision | None:
+        """The revision that is due at this look of the host; waited for if need be.
+
+        news: whether a solution of these keyframes contradicts the state. Only such a one is drawn.
+        """
+        if self._running is None or self._job is None or self._pool is None:
             return None
         self._due -= 1
         if self._due > 0:
             return None
-        running, self._running = self._running, None
-        return running.result()
+        found, self._running = self._running.result(), None
+        if isinstance(found, Revision):
+            return found if news(found.keyframes, found.solution) else None
+        self.solved += found is not None
+        if found is not None and news(self._job.question.graph.keyframes, found):
+            self._running, self._due = self._pool.submit(self._job.draw, found), _LOOKS
+        return None
 
     def drop(self) -> None:
         """What is being solved is no longer what happened; its end is waited for."""
@@ -105,16 +124,15 @@ class Reviser:
             self._pool = None
 
 
-def is_news(revision: Revision, state: State, graph: Graph, *, learnt: bool) -> bool:
-    """Whether a revision contradicts the state: a beacon stands elsewhere, or the map was drawn elsewhere.
+def is_news(keyframes: list[Keyframe], solution: Solution, state: State, graph: Graph, *, learnt: bool) -> bool:
+    """Whether a solution contradicts the state: a beacon stands elsewhere, or the map was drawn elsewhere.
 
     One that ends before the robot was carried off cannot be carried on to now, and is none.
 
     Args:
-      learnt: whether biases are known already.
+      keyframes: those that were solved. learnt: whether biases are known already.
     """
-    solution = revision.solution
-    if any(key.broken for key in graph.keyframes[len(revision.keyframes) :]):
+    if any(key.broken for key in graph.keyframes[len(keyframes) :]):
         return False
     slots, places, at = _current(solution, graph)
     if len(slots) < 2:
