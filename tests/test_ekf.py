@@ -175,3 +175,50 @@ def test_gradient_of_an_update_agrees_with_finite_differences():
 
     at = (np.linalg.cholesky(cov), H / np.sqrt(R)[:, None], innovation / np.sqrt(R))
     assert_gradient(value, tuple(map(jnp.asarray, at)))
+
+
+def test_inverse_by_cofactors() -> None:
+    rng = np.random.default_rng(7)
+    for _ in range(20):
+        A = np.eye(3) + rng.normal(size=(3, 3)) @ np.diag([1e3, 1e2, 1e4]) * 0.1
+        np.testing.assert_allclose(ekf.inverse3(jnp.asarray(A, jnp.float32)) @ A, np.eye(3), atol=2e-3)
+
+
+@pytest.mark.parametrize("blind", [False, True])
+def test_a_projected_measurement_is_that_of_the_information_form(blind: bool) -> None:
+    """With a full and a singular information, from a belief much wider than the measurement to a much surer one."""
+    rng = np.random.default_rng(3)
+    C = rng.normal(size=(3, 9))
+    for scale in (1e-4, 1.0, 1e4):
+        L = rng.normal(size=(9, 9))
+        before = Gaussian(jnp.asarray(rng.normal(size=9), jnp.float32), jnp.asarray(L @ L.T * 1e-2, jnp.float32))
+        root = rng.normal(size=(3, 2 if blind else 3))
+        Y, nu = scale * root @ root.T, rng.normal(size=3)
+        told = ekf.update_projected(before, *(jnp.asarray(a, jnp.float32) for a in (C, Y, nu)))
+        P = np.asarray(before.cov, float)
+        cov = np.linalg.inv(np.linalg.inv(P) + C.T @ Y @ C)
+        np.testing.assert_allclose(told.cov, cov, atol=1e-4 * np.abs(cov).max())
+        np.testing.assert_allclose(told.mean, before.mean + cov @ C.T @ Y @ nu, rtol=2e-2, atol=1e-3)
+
+
+def test_a_hundred_thousand_matches_keep_the_covariance_healthy() -> None:
+    """A known and an unknown direction: in float32, beside the same in float64."""
+    C = np.zeros((3, 8))
+    C[[0, 1, 2], [0, 1, 2]] = C[[0, 1, 2], [5, 6, 7]] = 1.0
+    Q, Y = np.diag([1e-4, 1e-4, 1e-6, 1e-9, 1e-9, 1e-8, 1e-8, 1e-9]), np.diag([1e4, 0.0, 1e6])
+
+    def run(dtype) -> np.ndarray:
+        c, q, y = (jnp.asarray(a, dtype) for a in (C, Q, Y))
+
+        def step(P, _):
+            return ekf.update_projected(Gaussian(jnp.zeros(8, dtype), P + q), c, y, jnp.zeros(3, dtype)).cov, None
+
+        return np.asarray(jax.jit(lambda P: jax.lax.scan(step, P, length=100_000)[0])(jnp.eye(8, dtype=dtype)), float)
+
+    small = run(jnp.float32)
+    with jax.enable_x64(True):
+        large = run(jnp.float64)
+    assert np.array_equal(small, small.T)
+    std = np.sqrt(np.diag(large))
+    assert np.linalg.eigvalsh(small / np.outer(std, std)).min() > -1e-5
+    np.testing.assert_allclose(np.sqrt(np.diag(small)), std, rtol=0.02)

@@ -66,7 +66,12 @@ def _packings(config: Config) -> tuple[Packing[Frame], Packing[Estimate]]:
     frame, state = empty_frame(config.max_beams, config.max_ranges), jax.eval_shape(partial(slam.init, config))
     params = jax.eval_shape(lambda: make_params(Settings(uwb=UwbSettings(max_beacons=config.nodes - 1))))
     _, estimate = jax.eval_shape(partial(slam.step, config), params, state, frame)
-    return Packing(frame), Packing(estimate)
+    return Packing(frame), Packing(_reported(estimate))
+
+
+def _reported(estimate: Estimate) -> Estimate:
+    """What the host is told: what only gradients ask for is left out, and so it is not computed."""
+    return estimate._replace(match_log_likelihood=None)
 
 
 @partial(jax.jit, static_argnums=0, donate_argnums=2)
@@ -86,7 +91,7 @@ def _guarded(config, params, state, frame):
     state, frame = lax.optimization_barrier((state, frame))
     frames, estimates = _packings(config)
     state, estimate = lax.optimization_barrier(slam.step(config, params, state, frames.unpack(frame)))
-    return state, estimates.pack_device(estimate)
+    return state, estimates.pack_device(_reported(estimate))
 
 
 class Session:

@@ -88,7 +88,8 @@ class Estimate(NamedTuple):
       score, known: of the match, see Match.
       poor, searched, drawn: what happened to the scan.
       innovation, normalised, weight: (M,) of the ranges.
-      log_likelihood: of the ranges; match_log_likelihood: of the match, 0 where there is no scan.
+      log_likelihood: of the ranges; match_log_likelihood: of the match, 0 where there is no scan; None where
+        nobody asks for it.
     """
 
     pose: Float[Array, "3"]
@@ -111,7 +112,7 @@ class Estimate(NamedTuple):
     normalised: Float[Array, "M"]
     weight: Float[Array, "M"]
     log_likelihood: Float[Array, ""]
-    match_log_likelihood: Float[Array, ""]
+    match_log_likelihood: Float[Array, ""] | None
 
 
 def init(config: Config) -> State:

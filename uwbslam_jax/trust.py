@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from uwbslam_jax import layout, ranging
 from uwbslam_jax.config import Params
-from uwbslam_jax.ekf import Gaussian, update_information
+from uwbslam_jax.ekf import Gaussian, inverse3, update_projected
 from uwbslam_jax.geometry import wrap_angle
 from uwbslam_jax.matching import Match
 from uwbslam_jax.measurements import Frame
@@ -108,7 +108,7 @@ def weigh(
     Y = _information(match, params, beams)
     innovation, S = _innovation(match, belief)
     # nu^T (S + Y^-1)^-1 nu without the inverse of a Y that may be singular
-    surprise = innovation @ jnp.linalg.solve(jnp.eye(3) + Y @ S, Y @ innovation)
+    surprise = innovation @ (inverse3(jnp.eye(3) + Y @ S) @ (Y @ innovation))
     return surprise, Y / (1.0 + surprise / SURPRISE) ** 2
 
 
@@ -120,7 +120,7 @@ def log_likelihood(match: Match, belief: Gaussian, params: Params, beams: Int[Ar
     """
     blind = jnp.eye(3) / _ANYWHERE**2
     innovation, S = _innovation(match, belief)
-    L = jnp.linalg.cholesky(S + jnp.linalg.inv(_information(match, params, beams) + blind))
+    L = jnp.linalg.cholesky(S + inverse3(_information(match, params, beams) + blind))
     half = solve_triangular(L, innovation, lower=True)
     normal = -0.5 * (half @ half) - jnp.sum(jnp.log(jnp.diagonal(L))) - 1.5 * math.log(2 * math.pi)
     return jnp.logaddexp(normal + math.log1p(-_ASTRAY), math.log(_ASTRAY / _ANYWHERE**3))
@@ -131,14 +131,14 @@ def _information(match: Match, params: Params, beams: Int[Array, ""]) -> Float[A
     share = params.independent_beams / jnp.maximum(beams, params.independent_beams)
     Y = match.information * (share / params.sigma_l**2)
     floor = jnp.diag(jnp.array(_MATCH_FLOOR) ** 2)
-    return jnp.linalg.solve(jnp.eye(3) + Y @ floor, Y)
+    return inverse3(jnp.eye(3) + Y @ floor) @ Y
 
 
 def fuse(belief: Gaussian, match: Match, information: Float[Array, "3 3"]) -> Gaussian:
     """EKF update by a matched pose, of which the map's own error is a part (match hard, fuse soft; DESIGN 1.9)."""
     C = layout.matched_pose_jacobian(layout.node_count(belief.mean.shape[0]))
     innovation, _ = _innovation(match, belief)
-    return update_information(belief, C.T @ information @ C, C.T @ (information @ innovation))
+    return update_projected(belief, C, information, innovation)
 
 
 def anchor(belief: Gaussian, at: Float[Array, "3"], share: Float[Array, "3 3"]) -> Gaussian:
