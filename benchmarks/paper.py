@@ -35,7 +35,7 @@ _ABOUT = """{seeds} seeds, each a workshop of 12 x 19 m or a corridor of its own
 deviation over the seeds. sigma_n = sigma_w = 0.1, LiDAR noise 0.01 m. Beacons' error as in Table I: as published, over
 time and beacons, after one rigid motion. A map with more than 0.03 stray cells is doubled or smeared. The robot's
 figures are after one rigid motion of robot and beacons. LiDAR only is gamma = 0 without ranges: HectorSLAM's objective,
-but begun from a predicted pose."""
+but begun from a predicted pose; 40 scans a second, 10 with ranges."""
 
 
 def measure(*, quick: bool) -> Report:

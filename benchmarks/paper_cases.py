@@ -44,19 +44,19 @@ SPEEDS = {
     SLOW: (0.4, 40.0, _LIDAR_ONLY),
     FAST: (0.8, 40.0, _LIDAR_ONLY),
     FAST_FEW: (0.8, 5.0, _LIDAR_ONLY),
-    PAPER_FAST: (0.8, 40.0, _PAPER),
-    FUSED_FAST: (0.8, 40.0, FilterSettings()),
+    PAPER_FAST: (0.8, 10.0, _PAPER),
+    FUSED_FAST: (0.8, 10.0, FilterSettings()),
 }
 """Speed [m/s], scans a second, settings."""
 LIDAR_ONLY, NOISIER, PAPER = "LiDAR only", "LiDAR only, noise 0.015 m", "preset paper"
 DYNAMIC = {PAPER: _PAPER, ROBUST: FilterSettings()}
 CORRIDOR = {
-    LIDAR_ONLY: (_LIDAR_SIGMA, _LIDAR_ONLY),
-    NOISIER: (0.015, _LIDAR_ONLY),
-    PAPER: (_LIDAR_SIGMA, _PAPER),
-    ROBUST: (_LIDAR_SIGMA, FilterSettings()),
+    LIDAR_ONLY: (_LIDAR_SIGMA, 40.0, _LIDAR_ONLY),
+    NOISIER: (0.015, 40.0, _LIDAR_ONLY),
+    PAPER: (_LIDAR_SIGMA, 10.0, _PAPER),
+    ROBUST: (_LIDAR_SIGMA, 10.0, FilterSettings()),
 }
-"""Noise of the LiDAR [m], settings."""
+"""Noise of the LiDAR [m], scans a second, settings."""
 
 
 @dataclass(frozen=True)
@@ -139,8 +139,8 @@ def _speed(seed: int) -> Iterator[_Run]:
 def _corridor(seed: int) -> Iterator[_Run]:
     base = scenario("corridor", seed)
     first, second, *_ = intervals.stops(base)
-    for setting, (sigma, chosen) in CORRIDOR.items():
-        made = replace(base, lidar=replace(base.lidar, rate=40.0, sigma=sigma))
+    for setting, (sigma, rate, chosen) in CORRIDOR.items():
+        made = replace(base, lidar=replace(base.lidar, rate=rate, sigma=sigma))
         outcome = measure(made, Settings(filter=chosen))
         at = [int(np.argmin(np.abs(outcome.whole.t - stop))) for stop in (first, second)]
         told, true = (
