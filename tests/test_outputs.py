@@ -266,6 +266,22 @@ class TestResultLog:
         assert values == {"score": "1", "hypotheses": "1"}
 
 
+def test_the_foxglove_layout_shows_what_is_there(run: Path) -> None:
+    """Its panels name topics of result.mcap, and the recording's own scans."""
+    reader = pytest.importorskip("mcap_ros2.reader")
+    layout = json.loads((Path(__file__).parents[1] / "docs" / "foxglove.json").read_text(encoding="utf-8"))
+    panels = layout["configById"]
+    named = {path["value"].split(".")[0] for path in panels["Plot!uwbslam-error"]["paths"]}
+    named |= set(panels["3D!uwbslam"]["topics"]) | {panels["DiagnosticStatusPanel!uwbslam"]["topicToRender"]}
+    topics = {message.channel.topic for message in reader.read_ros2_messages(str(run / "result.mcap"))}
+    assert named == topics - {"/tf"} | {"/scan"}
+
+    def shown(node: Any) -> set[str]:
+        return {node} if isinstance(node, str) else shown(node["first"]) | shown(node["second"])
+
+    assert shown(layout["layout"]) == set(panels)
+
+
 def test_diagnostics_come_at_most_ten_times_a_second(tmp_path: Path) -> None:
     reader = pytest.importorskip("mcap_ros2.reader")
     result = make_result()
