@@ -5,6 +5,7 @@ Raw ranges wait until the next keyframe is there: only then is it known where on
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -50,10 +51,11 @@ class Mean(NamedTuple):
 
 
 class _Heard(NamedTuple):
-    """One range of the robot: when [ns], where the antenna was on the map (2,), distance [m]."""
+    """One range of the robot: when [ns], where the antenna was on the map [m], distance [m]."""
 
     stamp: float
-    antenna: np.ndarray
+    x: float
+    y: float
     distance: float
 
 
@@ -99,17 +101,19 @@ class RangeMeans:
         r = frame.frame.ranges
         moving = np.asarray(estimate.moving)
         usable = np.asarray(r.valid) & ~(np.asarray(r.power_gap) > nlos_gap_db) & ~(moving[r.i] | moving[r.j])
-        lever = np.asarray(params.antenna, float)
-        motion = np.append(np.asarray(estimate.velocity, float), float(estimate.yaw_rate))
-        for k in np.flatnonzero(usable):
-            i, j = sorted((int(r.i[k]), int(r.j[k])))
-            distance, age = float(r.range[k]), float(r.age[k])
+        # plain numbers: a hundred of these ranges a frame are handled one by one
+        ahead, left = np.asarray(params.antenna, float).tolist()
+        (x, y, yaw), (vx, vy), turning = pose.tolist(), estimate.velocity.tolist(), float(estimate.yaw_rate)
+        columns = (np.asarray(column)[usable].tolist() for column in (r.i, r.j, r.range, r.age))
+        for a, b, distance, age in zip(*columns, strict=True):
+            i, j = min(a, b), max(a, b)
             if i > 0:
                 self.pairs.setdefault((self.node(i), self.node(j)), deque(maxlen=_MOST)).append(distance)
                 continue
-            then = pose + age * motion
+            c, s = math.cos(yaw + age * turning), math.sin(yaw + age * turning)
+            place = x + age * vx + c * ahead - s * left, y + age * vy + s * ahead + c * left
             self._newest.setdefault(j, deque(maxlen=_WINDOW)).append(distance)
-            heard = _Heard(frame.stamp + age * 1e9, then[:2] + turned(then[2], lever), distance)
+            heard = _Heard(frame.stamp + age * 1e9, *place, distance)
             self._open.setdefault(self.node(j), deque(maxlen=_MOST)).append(heard)
 
     def _scatter(self, slot: int) -> float:
@@ -141,12 +145,11 @@ class RangeMeans:
         self._open.clear()
 
     def _mean(self, at, node, start, span, poses, scatter, heard: list[_Heard]) -> Mean:
-        distance = np.array([one.distance for one in heard])
-        middle = np.sort(distance)[len(distance) // 2]  # one of them, so that at least one is near it
+        middle = sorted(one.distance for one in heard)[len(heard) // 2]  # one of them, so at least one is near it
         ok = [one for one in heard if abs(one.distance - middle) < _WILD_M]
-        share = np.clip((np.mean([one.stamp for one in ok]) - start) / span, 0.0, 1.0)
-        antenna = np.mean([one.antenna for one in ok], axis=0)
-        before, after = (turned(-pose[2], antenna - pose[:2]) for pose in poses)
+        stamp, *antenna, distance = (sum(column) / len(ok) for column in zip(*ok, strict=True))
+        share = min(max((stamp - start) / span, 0.0), 1.0)
+        before, after = (turned(-pose[2], np.array(antenna) - pose[:2]) for pose in poses)
         sigma = mean_sigma(len(ok), scatter, self.sigma_n)
         loud = sigma > mean_sigma(1, self.sigma_n, self.sigma_n)
-        return Mean(at, node, float(share), before, after, float(np.mean([one.distance for one in ok])), sigma, loud)
+        return Mean(at, node, share, before, after, distance, sigma, loud)
