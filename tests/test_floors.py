@@ -25,7 +25,7 @@ FLOORS: dict[float, str] = {
     5: "slam",
     5.1: "beacon_state heard registration redraw range_means",
     5.2: "graph",
-    5.25: "steps growth",
+    5.25: "steps",
     5.3: "smoothing",
     6: "startup beacons",
     6.1: "history",

@@ -21,7 +21,6 @@ from uwbslam_jax import layout, slam, startup
 from uwbslam_jax.beacons import BeaconKeeper
 from uwbslam_jax.config import Config, Params, Settings, UwbSettings, make_config, make_params
 from uwbslam_jax.graph import Graph
-from uwbslam_jax.growth import Growth
 from uwbslam_jax.hindsight import Hindsight, Question, look_back
 from uwbslam_jax.history import History
 from uwbslam_jax.keyframes import Buffer
@@ -104,7 +103,7 @@ class Session:
       status: of the start-up, in words.
       found_bias: slot -> range bias that was found beyond the configured one [m]; empty where there is none.
       history: what was reported so far.
-      hindsight: the run's solution once the run is over, else None.
+      graph: what the run as a whole is solved from. hindsight: its solution once the run is over, else None.
       taken_over: how often the state was corrected by the run so far, solved as a whole.
       listener: called with each frame and its estimate when stepped frame by frame, before the host has its look.
       fixed: whether map and beacons are taken as they are: the run only localises.
@@ -129,7 +128,7 @@ class Session:
         self._solved_at = self._solved_with = 0
         self._buffer = self._new_buffer()
         self._keeper = BeaconKeeper(settings)
-        self._growth = Growth(Graph(RangeMeans(settings.uwb.sigma_n)))
+        self.graph = Graph(RangeMeans(settings.uwb.sigma_n))
         self.hindsight: Hindsight | None = None
         self._looks_back = settings.filter.preset == "robust" and not settings.filter.lidar_only
         self._reviser = Reviser()
@@ -142,11 +141,6 @@ class Session:
     def slots(self) -> dict[int, int]:
         """Node id -> slot, as far as heard."""
         return self._slots
-
-    @property
-    def graph(self) -> Graph:
-        """What the run as a whole is solved from, with all that was seen until the last look."""
-        return self._growth.graph
 
     @property
     def revisions(self) -> int:
@@ -200,7 +194,6 @@ class Session:
         if self._pending:
             self._look()
         self._reviser.close()
-        self._growth.close()
         question = self._question()
         self.hindsight = None if question is None else look_back(question, self.history)
         if self.hindsight is None:
@@ -253,7 +246,7 @@ class Session:
         first = len(self.history.stamps) - len(pending)
         numbered = [(first + k, frame, estimate) for k, (frame, estimate) in enumerate(pending)]
         if self._looks_back:
-            self._growth.add(self.config, self._params_on_host(), numbered)
+            self.graph.add(self.config, self._params_on_host(), numbered)
         if not self.settings.filter.lidar_only:
             if self.decided_at is None:
                 self._start_up(pending)
@@ -326,14 +319,14 @@ class Session:
     def _revise(self, now: int) -> None:
         """Take over what the run so far tells, where the state contradicts it; begin to ask again."""
         revision = self._reviser.look(
-            lambda keyframes, found: is_news(keyframes, found, self.state, self.graph, learnt=bool(self.found_bias))
+            partial(is_news, state=self.state, graph=self.graph, learnt=bool(self.found_bias))
         )
         if revision is not None:
             self._learn_biases(revision.solution, now)
             self._take_over(revision)
             self.taken_over += 1
             self.history.event(now, "beacons and map corrected by the run so far")
-        if self._looks_back and self._reviser.wants(self._growth.keyframes):
+        if self._looks_back and self._reviser.wants(len(self.graph.keyframes)):
             question = self._question()
             if question is not None:
                 epoch = float(self.state.map_spread.way)

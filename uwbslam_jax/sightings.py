@@ -212,7 +212,7 @@ class Verdict(NamedTuple):
     Attributes:
       fits: they do.
       carried: the motion that explains them instead, None where there is none; rows: that say so.
-      bias: median of measured minus expected [m].
+      bias: median of measured minus expected [m]; 0 where what is left is noise.
     """
 
     fits: bool
@@ -234,9 +234,11 @@ def judge(sightings: Sightings, known: Known, slot: int, velocity: np.ndarray) -
     here = known.places[slot] + time[:, None] * velocity
     rests = not np.any(velocity)
     off = distance - np.linalg.norm(here - at, axis=1)
-    bias = float(np.median(off)) if len(rows) else 0.0
+    if len(rows) < 5 or _is_noise(here, at, off / sigma, sigma, time):
+        return Verdict(True, None, rows, 0.0)
+    bias = float(np.median(off))
     as_it_is = misfit(here, at, distance, sigma)
-    if len(rows) < 5 or as_it_is.sum() < DECIDED or _is_noise(here, at, off / sigma, sigma, time):
+    if as_it_is.sum() < DECIDED:
         return Verdict(True, None, rows, bias)
     biased = as_it_is - misfit(here, at, distance - bias, sigma)
     spots = _moving_fits(rows, known, known.places[slot])
