@@ -193,6 +193,7 @@ def _step(config: Config, params: Params, state: State, frame: Frame) -> tuple[S
     levels = tuple(lax.stop_gradient(level) for level in state.grid.levels)
     state, told = slam.step(config, params, state._replace(grid=state.grid._replace(levels=levels)), frame)
     used = jnp.sum(told.weight > 0).astype(jnp.float32)
+    assert told.match_log_likelihood is not None  # only the host goes without
     return state, Losses(-told.log_likelihood, -told.match_log_likelihood, used, told.pose)
 
 
