@@ -112,3 +112,8 @@ def test_image_is_cropped_to_what_was_observed():
     assert picture.log_odds.shape == (TILE, TILE)
     assert picture.log_odds[3, 5] == 1.0
     np.testing.assert_allclose(picture.origin, [0.0, -SIDE], atol=1e-6)
+
+
+def test_a_robot_that_is_nowhere_moves_no_window() -> None:
+    assert not Tiles(0.05).needs_move(np.zeros(2), 1024, np.array([np.nan, 3.0]))
+    assert Tiles(0.05).needs_move(np.zeros(2), 1024, np.array([3.0, 60.0]))

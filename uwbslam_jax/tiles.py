@@ -49,8 +49,9 @@ class Tiles:
             self._kept[row, col] = {k: layer[n] for k, layer in zip(keys, layers, strict=True)}
 
     def needs_move(self, origin: np.ndarray, cells: int, robot: np.ndarray) -> bool:
-        """Whether the robot (2,) [m] is too far off the middle of the window at origin (2,) [m]."""
-        return bool(np.abs(self._offset(origin, cells, robot)).max() > _SLACK)
+        """Whether the robot (2,) [m] is too far off the middle of the window at origin (2,) [m]; one that is nowhere (a
+        state that is not finite any more) is not."""
+        return bool(np.isfinite(robot).all()) and bool(np.abs(self._offset(origin, cells, robot)).max() > _SLACK)
 
     def _offset(self, origin: np.ndarray, cells: int, robot: np.ndarray) -> np.ndarray:
         middle = origin + cells * self.resolution / 2
