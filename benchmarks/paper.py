@@ -71,7 +71,6 @@ def _text(found: _Found, seeds: int) -> str:
     lines = [_ABOUT.format(seeds=seeds).replace("\n", " ")]
     for experiment, title in _TITLES.items():
         settings = [setting for name, setting in found if name == experiment]
-        settings = [s for s in _ORDER[experiment] if s in settings]
         names = list(found[experiment, settings[0]])
         lines += ["", f"### {title}", "", line(["", *names]), line(["---", *["---:"] * len(names)])]
         for setting in settings:
@@ -80,14 +79,6 @@ def _text(found: _Found, seeds: int) -> str:
             told = [f"{mine}; paper {theirs[n]}" if n in theirs else mine for n, mine in zip(names, cells, strict=True)]
             lines.append(line([setting, *told]))
     return "\n".join([*lines, "", "### What is asked", ""])
-
-
-_ORDER: dict[str, Sequence[str]] = {
-    "workshop": [*cases.WORKSHOP],
-    "dynamic": [*cases.DYNAMIC],
-    "speed": [*cases.SPEEDS],
-    "corridor": [*cases.CORRIDOR],
-}
 
 
 def _spread(values: Sequence[float]) -> str:

@@ -140,7 +140,7 @@ def _corridor(seed: int) -> Iterator[_Run]:
     base = scenario("corridor", seed)
     first, second, *_ = intervals.stops(base)
     for setting, (sigma, rate, chosen) in CORRIDOR.items():
-        made = replace(base, lidar=replace(base.lidar, rate=rate, sigma=sigma))
+        made = _noisy(base, rate, sigma)
         outcome = measure(made, Settings(filter=chosen))
         at = [int(np.argmin(np.abs(outcome.whole.t - stop))) for stop in (first, second)]
         told, true = (
@@ -153,9 +153,8 @@ EXPERIMENTS = {"workshop": _workshop, "dynamic": _dynamic, "speed": _speed, "cor
 """Each yields setting, scenario, outcome and figures for a seed."""
 
 
-def _noisy(made: Scenario, rate: float | None = None) -> Scenario:
-    lidar = replace(made.lidar, sigma=_LIDAR_SIGMA, rate=rate or made.lidar.rate)
-    return replace(made, lidar=lidar)
+def _noisy(made: Scenario, rate: float | None = None, sigma: float = _LIDAR_SIGMA) -> Scenario:
+    return replace(made, lidar=replace(made.lidar, sigma=sigma, rate=rate or made.lidar.rate))
 
 
 def _of(outcome: Outcome, *names: str) -> Figures:

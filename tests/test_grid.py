@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from functools import partial
 
 import jax
@@ -322,3 +323,20 @@ def test_end_points_fall_where_the_room_is():
     t = np.clip(((ends[:, None] - a) * (b - a)).sum(2) / ((b - a) ** 2).sum(1), 0, 1)
     off = np.linalg.norm(ends[:, None] - (a + t[..., None] * (b - a)), axis=2).min(axis=1)
     np.testing.assert_allclose(off, 0.0, atol=1e-5)
+
+
+def test_a_scan_is_drawn_in_place_also_where_it_may_not_be_drawn() -> None:
+    """As in a step: no level of the map is copied, whose memory is reused."""
+    grid = occupancy.empty(256, 3, 0.05)
+    beams = jnp.zeros(64)
+    sweep = occupancy.Sweep(
+        jnp.zeros((64, 2)), beams > -1, jnp.zeros(3), jnp.float32(0.0), jnp.float32(0.1), beams + 1.0
+    )
+
+    def drawn(grid, wanted, pose):
+        return jax.lax.cond(wanted, lambda g: occupancy.integrate(g, pose, sweep, 0.05), lambda g: g, grid)
+
+    compiled = jax.jit(drawn, donate_argnums=0).lower(grid, jnp.bool_(True), jnp.zeros(3)).compile().as_text()
+    sizes = "|".join(f"{n},{n}" for n in (256, 128, 64))
+    assert re.search(rf"f32\[({sizes})\]\S* scatter\(", compiled)
+    assert not re.findall(rf"f32\[({sizes})\]\S* copy\(", compiled)

@@ -25,8 +25,6 @@ COMMANDS = {
 }
 """Name -> what it does, in a line."""
 
-_SWITCH_S = 2e-4
-"""For so long a thread may keep the others from running Python [s]."""
 BAD_INPUT = 2
 INTERRUPTED = 130
 
@@ -83,8 +81,6 @@ def prepare() -> None:
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # the step must not wait long for a thread beside it that runs Python
-    sys.setswitchinterval(_SWITCH_S)
     # the same holds for XLA's kernels of a step, each of which takes microseconds
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
     os.environ.setdefault("NPROC", "1")  # size of XLA's own thread pool

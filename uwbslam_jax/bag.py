@@ -58,10 +58,9 @@ class Bag:
     @property
     def truncated(self) -> str | None:
         """Where and why the recording breaks, None where it does not (or is not known to, before `records`)."""
-        broken = [part for part in self._parts if part.truncated]
         if len(self._parts) == 1:
             return self._parts[0].truncated
-        return "; ".join(f"{part.path.name}: {part.truncated}" for part in broken) or None
+        return "; ".join(f"{part.path.name}: {part.truncated}" for part in self._parts if part.truncated) or None
 
     def records(self, channels: set[int] | None = None) -> Iterator[RawMessage]:
         """Yields the messages of these channels (all by default) by log time, equal ones in the order of the files."""

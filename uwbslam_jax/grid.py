@@ -169,8 +169,6 @@ def _integrate_level(level, origin, size, ends, sensor, yaw, sweep):
     inside = sweep.valid & jnp.all((cell >= 0) & (cell < cells), axis=-1)
     clipped = jnp.clip(cell, 0, cells - 1)
     struck = jnp.clip(level[clipped[:, 1], clipped[:, 0]] + HIT, *CLAMP)
-    # what is read of the level is read before any of it is written: so it is written where it is, without a copy
-    struck, level = lax.optimization_barrier((struck, level))
     block = lax.dynamic_slice(level, (start[1], start[0]), (2 * half, 2 * half))
     # near the window's edge the block cannot be centred; its tables are shifted by as many cells
     shift = start - (middle - half)
@@ -178,7 +176,9 @@ def _integrate_level(level, origin, size, ends, sensor, yaw, sweep):
     distance = _shifted(distance, shift)
     # a sensor outside the window is beyond the shifted tables: it frees nothing
     free = _passed(bearing, distance, yaw, size, sweep) & jnp.all((middle >= 0) & (middle <= cells))
-    block = jnp.where(free, jnp.maximum(block + FREE, CLAMP[0]), block) + 0.0 * struck[0]
+    block = jnp.where(free, jnp.maximum(block + FREE, CLAMP[0]), block)
+    # adds nothing, but what is written now needs what was read of the level before: without, XLA keeps a copy for it
+    block = block + 0.0 * struck[0]
     freed = lax.dynamic_update_slice(level, block, (start[1], start[0]))
     row, col = jnp.where(inside, cell[:, 1], cells), jnp.where(inside, cell[:, 0], cells)
     # many beams in one cell write the same value: once hit is once hit
