@@ -96,6 +96,17 @@ def test_a_time_that_was_damaged_a_little_does_not_move_the_clock(by: int) -> No
     assert np.abs(np.delete(late, [500, 900, 1300])[400:]).max() < 1.0
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_nothing_is_stamped_later_than_it_came(seed: int) -> None:
+    """Not even where delays end and come back, and what ends them is not equally early."""
+    true, device, received = story(60.0, delay=4.0, seed=seed)
+    held = (np.arange(true.size) // 200) % 2 == 0
+    late = received + held * 30 * MS
+    clock = DeviceClock()
+    stamps = [clock.host_stamp(int(d), int(r)) for d, r in zip(device, late, strict=True)]
+    assert all(stamp is not None and stamp <= r for stamp, r in zip(stamps, late.tolist(), strict=True))
+
+
 def test_a_delay_that_ends_is_followed() -> None:
     true, device, received = story(60.0, delay=0.1)
     held = np.arange(true.size) < 800

@@ -86,10 +86,10 @@ class DeviceClock:
         if not -SOONER < late - self._envelope(x) < LATER:
             return self._doubt(device, received)
         self._strange.clear()
-        if not self._believed(x, late):
-            return received - round(self._least_delay(x, self._envelope(x)) * 1e9)
-        ahead = x + self._envelope(x) - self._least_delay(x, late)
-        return zero[1] + round(ahead * 1e9)
+        least = self._least_delay(x, late if self._believed(x, late) else self._envelope(x))
+        # nothing arrives before it was measured, even where what came before was later than this
+        arrived = min(zero[1] + round((x + self._envelope(x)) * 1e9), received)
+        return arrived - round(least * 1e9)
 
     def _believed(self, x: float, late: float) -> bool:
         """Lets a point lower the envelope, unless it does by much and alone."""
