@@ -134,7 +134,7 @@ def test_the_paper_and_lidar_only_do_not_look_back() -> None:
     settings = dataclasses.replace(SETTINGS, filter=FilterSettings(preset="paper"), uwb=UwbSettings(max_beacons=3))
     run, _ = driven(settings)
     assert run.hindsight is None
-    assert not run.graph.keyframes
+    assert not len(run.graph.keyframes)
 
 
 def test_between_keyframes_a_direction_that_is_not_seen_is_even(finished) -> None:
@@ -144,16 +144,16 @@ def test_between_keyframes_a_direction_that_is_not_seen_is_even(finished) -> Non
     sight, seen = np.array(history.sight), np.array(history.map_poses)
     try:
         key = len(poses) // 2
-        frames = range(run.graph.keyframes[key].frame, run.graph.keyframes[key + 1].frame)
+        frames = range(*run.graph.keyframes["frame"][key : key + 2])
         for k in frames[1:]:
             history.sight.values[k] = np.inf
             history.map_poses.values[k] += np.array([0.5, -0.5, 0.0])
         track = _track(run.graph, history, poses)
         for k in frames[1:]:
-            begin, end = run.graph.keyframes[key].stamp, run.graph.keyframes[key + 1].stamp
+            begin, end = run.graph.keyframes["stamp"][key : key + 2]
             share = (history.stamps[k] - begin) / (end - begin)
             want = (1 - share) * poses[key, :2] + share * poses[key + 1, :2]
             np.testing.assert_allclose(track[k, :2], want, atol=1e-9)
     finally:
         history.sight.values[:], history.map_poses.values[:] = sight, seen
-    assert np.all(np.abs(wrapped(track[:, 2] - run.hindsight.track[:, 2])) < 1e-9)
+    assert np.all(np.abs(wrapped(track[:, 2] - run.hindsight.track[:, 2])) < 1e-5)  # the history is in single precision

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -196,18 +194,16 @@ def mounted(change: np.ndarray, bias: dict[int, float], *, wheels: bool):
     rng = np.random.default_rng(5)
     steps = np.vstack([np.zeros(3), relative(truth[:-1], truth[1:])])
     steps = 1.02 * steps + rng.normal(0, 0.003, steps.shape)
-    graph.keyframes = [
-        replace(key, pose=pose, wheels=step if wheels else None)
-        for key, pose, step in zip(graph.keyframes, wrong, steps, strict=True)
-    ]
-    graph.edges = [e._replace(between=compose(compose(back, e.between), change)) for e in graph.edges]
-    means = []
+    graph.keyframes["pose"][:] = wrong
+    if wheels:
+        graph.keyframes["wheels"][:] = steps
+    between = graph.edges["between"]
+    between[:] = compose(compose(np.tile(back, (len(between), 1)), between), np.tile(change, (len(between), 1)))
     for mean in graph.ranges.means:
-        then = (1 - mean.share) * wrong[mean.at] + mean.share * wrong[mean.at + 1]
+        then = (1 - mean["share"]) * wrong[mean["at"]] + mean["share"] * wrong[mean["at"] + 1]
         antenna = then[:2] + rotated(then[2], ANTENNA)
-        ends = [rotated(-p[2], antenna - p[:2]) for p in wrong[[mean.at, mean.at + 1]]]
-        means.append(mean._replace(before=ends[0], after=ends[1]))
-    graph.ranges.means = means
+        ends = [rotated(-p[2], antenna - p[:2]) for p in wrong[[mean["at"], mean["at"] + 1]]]
+        mean["before"], mean["after"] = ends
     return graph
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import resource
+from array import array
 from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
@@ -40,7 +41,7 @@ class Facts:
     odometry_used: bool = False
     wall_s: float = 0.0
     compile_s: float = 0.0
-    step_ms: list[float] = field(default_factory=list)
+    step_ms: array[float] = field(default_factory=lambda: array("f"))
     relative: Relative | None = None
 
 
@@ -60,13 +61,13 @@ def to_result(session: Session, facts: Facts) -> Result:
     stamps = np.array(history.stamps, np.int64)[at]
     start = int(stamps[0]) if len(stamps) else 0
     ids = {slot: node for node, slot in session.slots.items()}
-    residuals = [((t - start) / 1e9, ids[i], ids[j], r) for t, i, j, r in history.residuals]
+    residuals = [((t - start) / 1e9, ids[i], ids[j], r) for t, i, j, r in history.residuals.values.tolist()]
     tracks: dict[int, list[tuple[float, float, float, float]]] = {}
-    for t, slot, x, y, sigma in history.tracks:
+    for t, slot, x, y, sigma in history.tracks.values.tolist():
         tracks.setdefault(ids[slot], []).append(((t - start) / 1e9, x, y, sigma))
     online = np.array(history.poses, float).reshape(-1, 3)
     track = online if session.hindsight is None else session.hindsight.track
-    diagnostics = {name: np.array(values)[at] for name, values in history.diagnostics.items()}
+    diagnostics = {name: values[at] for name, values in history.diagnostics.items()}
     if len(facts.step_ms) == len(history.stamps):
         diagnostics["step_ms"] = np.array(facts.step_ms, float)[at]
     return Result(

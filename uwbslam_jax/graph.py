@@ -1,18 +1,20 @@
 """The graph of a whole run: keyframes, scans laid over older scans, and the ranges taken on the way.
 
-Collected while the steps run, solved by `smoothing`. Host arrays; grows with the way, not with the time.
+Collected while the steps run, solved by `smoothing`. Host arrays; grows with the way, not with the time, and its scans
+with the ground that was covered.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 
 import jax
 import numpy as np
 from scipy import sparse
 
+from uwbslam_jax.columns import Column
 from uwbslam_jax.config import Config, Params
 from uwbslam_jax.keyframes import turned
 from uwbslam_jax.measurements import Scan, Snapshot, StampedFrame
@@ -47,60 +49,40 @@ _HANG_TOGETHER = 8
 """So many keyframes whose scans lie over each other are a place."""
 _FOUND_S = 5.0
 """A robot that was carried is found within so long."""
+_SCANS_OF_A_PLACE = 8
+_PLACE = (1.5, 0.8)
+"""Scans taken so near to each other see the same [m, rad]; more than so many of them tell nothing new."""
 _MM = 1000.0
 """Scans are kept in whole millimetres."""
 
 
-@dataclass(frozen=True)
-class Keyframe:
-    """One pose of the graph.
+KEYFRAME = np.dtype(
+    [
+        ("stamp", np.int64),
+        ("frame", np.int32),
+        ("pose", np.float64, 3),
+        ("informed", np.float32, (3, 3)),
+        ("drift", np.float32, 2),
+        ("yaw_rate", np.float32),
+        ("wheels", np.float64, 3),
+        ("broken", np.bool_),
+    ]
+)
+"""One pose of the graph.
 
-    Attributes:
-      stamp: [ns]; frame: number of it in the history.
-      pose: (3,) where the map has it: what its match reported, or what was expected where nothing matched [m, m, rad].
-      informed: (3, 3) information of the match in the map's frame, 0 where there is none.
-      scan: what it saw, None where there is nothing to see; lengths in millimetres.
-      drift: (2,) velocity in the robot's frame [m/s]; yaw_rate [rad/s].
-      wheels: (3,) motion since the keyframe before by odometry, None where it was not measured all the way.
-      broken: whether the robot was carried on the way from the keyframe before.
-    """
+stamp: [ns]; frame: number of it in the history. pose: where the map has it: what its match reported, or what was
+expected where nothing matched [m, m, rad]. informed: information of the match in the map's frame, 0 where there is
+none. drift: velocity in the robot's frame [m/s]; yaw_rate [rad/s]. wheels: motion since the keyframe before by
+odometry, NaN where it was not measured all the way. broken: whether the robot was carried on the way from the keyframe
+before.
+"""
 
-    stamp: int
-    frame: int
-    pose: np.ndarray
-    informed: np.ndarray
-    scan: Scan | None
-    drift: np.ndarray
-    yaw_rate: float
-    wheels: np.ndarray | None
-    broken: bool
+EDGE = np.dtype([("old", np.int32), ("new", np.int32), ("between", np.float64, 3), ("information", np.float32, (3, 3))])
+"""A keyframe relative to an older one, by their scans.
 
-    def snapshot(self) -> Snapshot:
-        """Its scan as it was."""
-        assert self.scan is not None
-        reach = self.scan.ranges.astype(np.float32) / np.float32(_MM)
-        scan = self.scan._replace(ranges=reach, valid=self.scan.ranges > 0)
-        return Snapshot(scan, np.float32(self.drift), np.float32(self.yaw_rate))
-
-    @property
-    def blind(self) -> bool:
-        """Whether its scan does not tell where it is in some direction."""
-        return _blind(self.informed)
-
-
-class Edge(NamedTuple):
-    """A keyframe relative to an older one, by their scans.
-
-    Attributes:
-      old, new: numbers of the keyframes.
-      between: (3,) pose of the new one in the frame of the old one [m, m, rad].
-      information: (3, 3) of it, in that frame.
-    """
-
-    old: int
-    new: int
-    between: np.ndarray
-    information: np.ndarray
+old, new: numbers of the keyframes. between: pose of the new one in the frame of the old one [m, m, rad]. information:
+of it, in that frame.
+"""
 
 
 @dataclass
@@ -108,45 +90,64 @@ class Graph:
     """What was collected so far.
 
     Attributes:
-      ranges, keyframes, edges: see there.
+      ranges: see there. keyframes: rows of KEYFRAME; edges: rows of EDGE.
+      scans: of each keyframe what it saw, lengths in millimetres; None where there was nothing to see, or others saw
+        the same.
     """
 
     ranges: RangeMeans
-    keyframes: list[Keyframe] = field(default_factory=list)
-    edges: list[Edge] = field(default_factory=list)
-    _wheels: np.ndarray | None = field(default_factory=lambda: np.zeros(3))
+    keyframes: Column = field(default_factory=lambda: Column(dtype=KEYFRAME))
+    edges: Column = field(default_factory=lambda: Column(dtype=EDGE))
+    scans: list[Scan | None] = field(default_factory=list)
+    _wheels: np.ndarray = field(default_factory=lambda: np.zeros(3))
     _broken: bool = False
     _anchors: list[int] = field(default_factory=list)
+    _settled: int = 0
+    _kept: list[int] = field(default_factory=list)
 
     def copy(self) -> Graph:
         """What there is now; what is added later does not change it."""
-        return Graph(self.ranges.copy(), list(self.keyframes), list(self.edges))
+        return Graph(self.ranges.copy(), self.keyframes.copy(), self.edges.copy(), list(self.scans))
 
     def poses(self) -> np.ndarray:
         """(N, 3) where the map has the keyframes [m, m, rad]."""
-        return np.array([key.pose for key in self.keyframes]).reshape(-1, 3)
+        return self.keyframes["pose"].copy()
 
     def stamps(self) -> np.ndarray:
         """(N,) of the keyframes [ns]."""
-        return np.array([key.stamp for key in self.keyframes], np.int64)
+        return self.keyframes["stamp"].copy()
 
-    def seen(self, poses: np.ndarray, first: int = 0) -> list[tuple[np.ndarray, Snapshot]]:
+    def blind(self) -> np.ndarray:
+        """(N,) whether a keyframe's scan does not tell where it is in some direction."""
+        return _blind(self.keyframes["informed"])
+
+    def rolled(self) -> np.ndarray:
+        """(N,) whether wheels measured all the way from the keyframe before."""
+        return np.isfinite(self.keyframes["wheels"][:, 0])
+
+    def snapshot(self, number: int) -> Snapshot:
+        """The scan of a keyframe that has one, as it was."""
+        packed, key = self.scans[number], self.keyframes[number]
+        assert packed is not None
+        reach = packed.ranges.astype(np.float32) / np.float32(_MM)
+        return Snapshot(packed._replace(ranges=reach, valid=packed.ranges > 0), key["drift"].copy(), key["yaw_rate"])
+
+    def seen(self, poses: np.ndarray, first: int = 0) -> Iterator[tuple[np.ndarray, Snapshot]]:
         """What may be drawn, from a first keyframe on, at poses (N, 3): scans that hang together with many others.
 
         A few that hang only on each other were taken where nothing could be told: in somebody's arms, in smoke.
         """
-        count = len(self.keyframes)
-        ends = np.array([(edge.old, edge.new) for edge in self.edges], int).reshape(-1, 2)
-        tied = sparse.coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
+        count, old, new = len(self.keyframes), self.edges["old"], self.edges["new"]
+        tied = sparse.coo_array((np.ones(len(old)), (old, new)), shape=(count, count))
         _, part = sparse.csgraph.connected_components(tied, directed=False)
         size = np.bincount(part, minlength=1)
         kept = size >= min(_HANG_TOGETHER, size.max())
-        drawn = [k for k in np.flatnonzero(kept[part]) if k >= first and self.keyframes[k].scan is not None]
-        return [(poses[k], self.keyframes[k].snapshot()) for k in drawn]
+        drawn = [k for k in np.flatnonzero(kept[part]).tolist() if k >= first and self.scans[k] is not None]
+        return ((poses[k], self.snapshot(k)) for k in drawn)
 
     def placed(self, slot: int, since: int) -> None:
         """A beacon was found to rest where it was ranged from a time on [ns]; where it was before, nobody knows."""
-        self.ranges.forget(slot, lambda mean: self.keyframes[mean.at].stamp < since)
+        self.ranges.forget(slot, int(np.searchsorted(self.keyframes["stamp"], since)))
 
     def moved(self, slot: int) -> None:
         """A beacon is, or the robot (slot 0) was, somewhere else from now on."""
@@ -158,25 +159,24 @@ class Graph:
 
     def _doubt_last(self) -> None:
         """The robot was carried: its scans since one did not lie over the one before are not believed."""
-        tied = {edge.new for edge in self.edges if edge.old == edge.new - 1}
-        since = self.keyframes[-1].stamp - _FOUND_S * 1e9 if self.keyframes else 0
-        loose = [k for k, key in enumerate(self.keyframes) if k > 0 and key.stamp > since and k not in tied]
-        if loose:
-            first = loose[0]
-            self.edges = [edge for edge in self.edges if edge.new < first]
+        if not len(self.keyframes):
+            return
+        loose = self.keyframes["stamp"] > self.keyframes["stamp"][-1] - _FOUND_S * 1e9
+        loose[0] = False
+        loose[self.edges["new"][self.edges["old"] == self.edges["new"] - 1]] = False
+        if loose.any():
+            first = int(np.argmax(loose))
+            self.edges.keep(self.edges["new"] < first)
             self._anchors = [k for k in self._anchors if k < first]
-            self.keyframes[first:] = [replace(key, scan=None) for key in self.keyframes[first:]]
+            self.scans[first:] = [None] * (len(self.scans) - first)
 
     def put(self, poses: np.ndarray, turn: float) -> None:
         """The map was drawn again: keyframes so far are at poses (N, 3) in it, turned by an angle [rad]."""
         R = np.eye(3)
         c, s = np.cos(turn), np.sin(turn)
         R[:2, :2] = [[c, -s], [s, c]]
-        # new ones, not changed ones: a copy keeps what it has
-        self.keyframes = [
-            replace(key, pose=pose, informed=R @ key.informed @ R.T)
-            for key, pose in zip(self.keyframes, poses, strict=True)
-        ]
+        self.keyframes["pose"][:] = poses
+        self.keyframes["informed"][:] = R @ self.keyframes["informed"] @ R.T
 
     def add(self, config: Config, params: Params, seen: list[tuple[int, StampedFrame, Estimate]]) -> None:
         """Take in a few frames. seen: number in the history, frame and estimate of each."""
@@ -185,57 +185,56 @@ class Graph:
             self.ranges.hear(frame, estimate, pose, params, config.nlos_gap_db)
             self._roll(frame)
             informed = np.asarray(estimate.information, float)
-            if self.keyframes and not self._far(pose, frame.stamp, informed):
+            if len(self.keyframes) and not self._far(pose, frame.stamp, informed):
                 continue
-            drift = turned(-pose[2], np.asarray(estimate.velocity, float))
-            scan = _packed(frame.frame.scan) if _sees(frame) else None
-            turning = float(estimate.yaw_rate)
-            key = Keyframe(frame.stamp, number, pose, informed, scan, drift, turning, self._wheels, self._broken)
-            if self._broken or not self.keyframes:
+            if self._broken or not len(self.keyframes):
                 self.ranges.drop()
             else:
                 last = self.keyframes[-1]
-                self.ranges.close(len(self.keyframes) - 1, (last.stamp, key.stamp), (last.pose, key.pose))
-            self.keyframes.append(key)
+                stamps = int(last["stamp"]), frame.stamp
+                self.ranges.close(len(self.keyframes) - 1, stamps, (last["pose"], pose))
+            drift = turned(-pose[2], np.asarray(estimate.velocity, float))
+            told = pose, informed, drift, estimate.yaw_rate, self._wheels, self._broken
+            self.keyframes.append((frame.stamp, number, *told))
+            self.scans.append(_packed(frame.frame.scan) if _sees(frame) else None)
             self._wheels, self._broken = np.zeros(3), False
-            if scan is not None:
+            if self.scans[-1] is not None:
                 self._tie(params)
+            self._thin()
 
     def _far(self, pose: np.ndarray, stamp: int, informed: np.ndarray) -> bool:
         last = self.keyframes[-1]
-        moved = relative(last.pose, pose)
-        late = stamp - last.stamp > _BLIND_S * 1e9 and _blind(informed)
+        moved = relative(last["pose"], pose)
+        late = stamp - last["stamp"] > _BLIND_S * 1e9 and bool(_blind(informed[None])[0])
         return bool(self._broken or np.hypot(*moved[:2]) > _MOVED[0] or abs(wrapped(moved[2])) > _MOVED[1] or late)
 
     def _roll(self, frame: StampedFrame) -> None:
         odometry = frame.frame.odometry
         if not bool(odometry.valid):
-            self._wheels = None
-        elif self._wheels is not None:
+            self._wheels = np.full(3, np.nan)
+        elif np.isfinite(self._wheels[0]):
             step = np.asarray(odometry.increment, float)
             self._wheels = np.append(self._wheels[:2] + turned(self._wheels[2], step[:2]), self._wheels[2] + step[2])
 
     def _tie(self, params: Params) -> None:
         """Edges from the newest keyframe to older ones whose scans it can be laid over."""
         new = len(self.keyframes) - 1
-        key, old = self.keyframes[new], self._candidates(new)
+        old = self._candidates(new)
         if not old:
             return
         padded = (old * _TIES)[:_TIES]  # always as many: nothing is compiled again
-        guess = np.array([relative(self.keyframes[k].pose, key.pose) for k in padded])
-        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *[self.keyframes[k].snapshot() for k in padded])
-        found = jax.device_get(register(params, stacked, key.snapshot(), np.float32(guess)))
-        for k, target in enumerate(old):
-            pose, information = (np.asarray(a[k], float) for a in (found.pose, found.information))
-            if found.share[k] > _SHARE and np.all(np.abs(pose - guess[k]) < _BELIEVED):
-                self.edges.append(Edge(target, new, pose, information))
+        guess = relative(self.keyframes["pose"][padded], self.keyframes["pose"][new])
+        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *map(self.snapshot, padded))
+        found = jax.device_get(register(params, stacked, self.snapshot(new), np.float32(guess)))
+        believed = np.all(np.abs(found.pose - guess) < _BELIEVED, axis=1) & (found.share > _SHARE)
+        for k in np.flatnonzero(believed[: len(old)]):
+            self.edges.append((old[k], new, found.pose[k], found.information[k]))
 
     def _candidates(self, new: int) -> list[int]:
         """Keyframes to lay the newest one over: the last one, the nearest anchors, the oldest anchor in reach."""
-        key = self.keyframes[new]
-        poses = np.array([self.keyframes[k].pose for k in self._anchors]).reshape(-1, 3)
-        apart = np.linalg.norm(poses[:, :2] - key.pose[:2], axis=1)
-        cost = apart + np.abs(wrapped(poses[:, 2] - key.pose[2])) * _TURN_M
+        poses, pose = self.keyframes["pose"][self._anchors], self.keyframes["pose"][new]
+        apart = np.linalg.norm(poses[:, :2] - pose[:2], axis=1)
+        cost = apart + np.abs(wrapped(poses[:, 2] - pose[2])) * _TURN_M
         near = [self._anchors[k] for k in np.argsort(cost, kind="stable")[:_NEAREST] if apart[k] < _REACH_M]
         oldest = [self._anchors[k] for k in np.flatnonzero(apart < _REACH_M)[:1]]
         last = self._last_seen(new)
@@ -246,11 +245,31 @@ class Graph:
     def _last_seen(self, new: int) -> list[int]:
         """The keyframe with a scan before the newest one, where the robot was not carried since."""
         for k in range(new, 0, -1):
-            if self.keyframes[k].broken:
+            if self.keyframes["broken"][k]:
                 break
-            if self.keyframes[k - 1].scan is not None:
+            if self.scans[k - 1] is not None:
                 return [k - 1]
         return []
+
+    def _thin(self) -> None:
+        """Leave out the oldest scan of a place that enough others were taken at, but not an anchor's.
+
+        So the scans of a run are bounded by the ground, and the map is drawn from the newest. What may still be found
+        to have been taken in somebody's arms covers nothing.
+        """
+        poses, newest = self.keyframes["pose"], self.keyframes["stamp"][-1]
+        while self.keyframes["stamp"][self._settled] <= newest - _FOUND_S * 1e9:
+            k, self._settled = self._settled, self._settled + 1
+            if self.scans[k] is None:
+                continue
+            off = poses[self._kept] - poses[k]
+            same = (np.hypot(*off[:, :2].T) < _PLACE[0]) & (np.abs(wrapped(off[:, 2])) < _PLACE[1])
+            others = [self._kept[n] for n in np.flatnonzero(same)]
+            self._kept.append(k)
+            spare = [other for other in others if other not in self._anchors]
+            if len(others) >= _SCANS_OF_A_PLACE and spare:
+                self.scans[spare[0]] = None
+                self._kept.remove(spare[0])
 
 
 def map_pose(estimate: Estimate) -> np.ndarray:
@@ -281,8 +300,8 @@ def wrapped(angle):
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
-def _blind(informed: np.ndarray) -> bool:
-    return bool(np.linalg.eigvalsh(informed[:2, :2])[0] < _BLIND_M**-2)
+def _blind(informed: np.ndarray) -> np.ndarray:
+    return np.linalg.eigvalsh(informed[..., :2, :2])[..., 0] < _BLIND_M**-2
 
 
 def _sees(frame: StampedFrame) -> bool:

@@ -96,10 +96,8 @@ def _track(graph: Graph, history: History, after: np.ndarray) -> np.ndarray:
     Where scans tell the position, the way between two keyframes is what the matches say; in a direction that a scan
     cannot see, it is even.
     """
-    stamps, poses = np.array(history.stamps), np.array(history.map_poses).reshape(-1, 3)
-    keys = np.array([key.stamp for key in graph.keyframes])
-    before = np.array([key.pose for key in graph.keyframes])
-    broken = np.array([key.broken for key in graph.keyframes])
+    stamps, poses = np.array(history.stamps), np.array(history.map_poses, float)
+    keys, before, broken = graph.stamps(), graph.poses(), graph.keyframes["broken"]
     last = len(keys) - 1
     k = np.clip(np.searchsorted(keys, stamps, side="right") - 1, 0, last)
     n = np.minimum(k + 1, last)

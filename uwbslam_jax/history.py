@@ -1,14 +1,13 @@
 """What a run reported, kept on the host for the files that are written when it ends.
 
-A few numbers a frame in arrays, so that memory grows by about 120 bytes a frame; residuals are thinned.
+A few numbers a frame in arrays, so that memory grows by about a hundred bytes a frame; residuals are thinned.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
+from uwbslam_jax.columns import Column
 from uwbslam_jax.graph import map_pose, sight
 from uwbslam_jax.measurements import StampedFrame
 from uwbslam_jax.slam import Estimate
@@ -19,51 +18,23 @@ _RESIDUALS_EVERY_S = 1.0
 _TRACK_EVERY_S = 1.0
 
 
-class Column:
-    """Rows of one shape, appended one at a time, in one array that is doubled when it is full."""
-
-    def __init__(self, shape: tuple[int, ...] = (), dtype: type = np.float32):
-        self._rows = np.zeros((64, *shape), dtype)
-        self._count = 0
-
-    def append(self, row) -> None:
-        """One more row at the end."""
-        if self._count == len(self._rows):
-            self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
-        self._rows[self._count] = row
-        self._count += 1
-
-    @property
-    def values(self) -> np.ndarray:
-        """All rows so far, a view."""
-        return self._rows[: self._count]
-
-    def __len__(self) -> int:
-        return self._count
-
-    def __getitem__(self, index):
-        return self.values[index]
-
-    def __iter__(self) -> Iterator:
-        return iter(self.values)
-
-    def __array__(self, dtype=None, copy=None) -> np.ndarray:
-        return np.array(self.values, dtype)
-
-
-_DIAGNOSTICS = (
-    "match_score",
-    "known_share",
-    "poor_match",
-    "searched",
-    "drawn",
-    "hypotheses",
-    "beacons",
-    "ranges",
-    "ranges_used",
-    "ranges_nlos",
-    "ranges_doubted",
+_DIAGNOSTICS = np.dtype(
+    [
+        ("match_score", np.float32),
+        ("known_share", np.float32),
+        ("poor_match", np.bool_),
+        ("searched", np.bool_),
+        ("drawn", np.bool_),
+        ("hypotheses", np.uint32),
+        ("beacons", np.uint16),
+        ("ranges", np.uint16),
+        ("ranges_used", np.uint16),
+        ("ranges_nlos", np.uint16),
+        ("ranges_doubted", np.uint16),
+    ]
 )
+_RESIDUAL = np.dtype([("stamp", np.int64), ("i", np.int32), ("j", np.int32), ("residual", np.float32)])
+_TRACK = np.dtype([("stamp", np.int64), ("slot", np.int32), ("x", np.float32), ("y", np.float32), ("s", np.float32)])
 
 
 class History:
@@ -81,14 +52,14 @@ class History:
 
     def __init__(self) -> None:
         self.stamps = Column(dtype=np.int64)
-        self.poses = Column((3,), np.float64)
-        self.map_poses = Column((3,), np.float64)
+        self.poses = Column((3,))
+        self.map_poses = Column((3,))
         self.sight = Column()
         self.covs = Column((3, 3))
         self.has_scan = Column(dtype=np.bool_)
-        self._diagnostics = Column((len(_DIAGNOSTICS),))
-        self.residuals: list[tuple[int, int, int, float]] = []
-        self.tracks: list[tuple[int, int, float, float, float]] = []
+        self._diagnostics = Column(dtype=_DIAGNOSTICS)
+        self.residuals = Column(dtype=_RESIDUAL)
+        self.tracks = Column(dtype=_TRACK)
         self.events: list[tuple[int, str]] = []
         self.last_scan: tuple[int, StampedFrame, Estimate] | None = None
         self._residuals_at: dict[tuple[int, int], int] = {}
@@ -109,8 +80,9 @@ class History:
 
     @property
     def diagnostics(self) -> dict[str, np.ndarray]:
-        """Name -> one value a frame."""
-        return dict(zip(_DIAGNOSTICS, self._diagnostics.values.T, strict=True)) if len(self._diagnostics) else {}
+        """Name -> one value a frame (float32)."""
+        rows = self._diagnostics.values
+        return {name: rows[name].astype(np.float32) for name in _DIAGNOSTICS.names or ()} if len(rows) else {}
 
     def add(self, frame: StampedFrame, estimate: Estimate, hypotheses: int) -> None:
         """Take in one step."""
@@ -132,13 +104,13 @@ class History:
             pair = int(r.i[k]), int(r.j[k])
             if frame.stamp - self._residuals_at.get(pair, 0) > _RESIDUALS_EVERY_S * 1e9:
                 self._residuals_at[pair] = frame.stamp
-                self.residuals.append((frame.stamp, *pair, float(estimate.innovation[k])))
+                self.residuals.append((frame.stamp, *pair, estimate.innovation[k]))
         if frame.stamp - self._tracks_at > _TRACK_EVERY_S * 1e9:
             self._tracks_at = frame.stamp
             for slot in np.flatnonzero(estimate.active[1:]) + 1:
                 x, y = estimate.beacons[slot]
                 sigma = float(np.sqrt(max(np.linalg.eigvalsh(estimate.beacon_covs[slot])[-1], 0.0)))
-                self.tracks.append((frame.stamp, int(slot), float(x), float(y), sigma))
+                self.tracks.append((frame.stamp, slot, x, y, sigma))
         if self._seen is None or (active != self._seen.active).any():
             self._keep_beacons()
         self._seen = estimate

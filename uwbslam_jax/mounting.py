@@ -161,12 +161,12 @@ class Mounting:
 
     def _rolled(self) -> Array:
         """(N,) whether wheels measured the way from the keyframe before."""
-        return np.array([key.wheels is not None and not key.broken for key in self.graph.keyframes])
+        return self.graph.rolled() & ~self.graph.keyframes["broken"]
 
     def _steps(self) -> tuple[Array, Array]:
         new = np.flatnonzero(self._rolled())
         new = new[new > 0]
-        return new, np.array([self.graph.keyframes[k].wheels for k in new]).reshape(-1, 3)
+        return new, self.graph.keyframes["wheels"][new]
 
     def _wheels(self, rows: Rows, x: Array) -> None:
         new, wheels = self._steps()

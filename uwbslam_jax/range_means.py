@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict, deque
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
+from uwbslam_jax.columns import Column
 from uwbslam_jax.config import Params
 from uwbslam_jax.keyframes import mean_sigma, turned
 from uwbslam_jax.measurements import StampedFrame
@@ -30,24 +29,25 @@ Node = tuple[int, int]
 """A beacon at one of its resting places: slot, number of the place."""
 
 
-class Mean(NamedTuple):
-    """Ranges between the robot and a beacon at rest, averaged over half an interval between two keyframes.
+MEAN = np.dtype(
+    [
+        ("at", np.int32),
+        ("slot", np.int32),
+        ("place", np.int32),
+        ("share", np.float32),
+        ("before", np.float32, 2),
+        ("after", np.float32, 2),
+        ("distance", np.float32),
+        ("sigma", np.float32),
+        ("loud", np.bool_),
+    ]
+)
+"""Ranges between the robot and a beacon at rest, averaged over half an interval between two keyframes.
 
-    Attributes:
-      at: keyframe before. node: see there. share: of the way to the next keyframe.
-      before, after: (2,) the antenna in the frame of the keyframe before and of the one after [m].
-      distance: as measured, sigma: its standard deviation [m].
-      loud: whether the ranges scatter more than the radio does.
-    """
-
-    at: int
-    node: Node
-    share: float
-    before: np.ndarray
-    after: np.ndarray
-    distance: float
-    sigma: float
-    loud: bool
+at: keyframe before. slot, place: the node. share: of the way to the next keyframe. before, after: the antenna in the
+frame of the keyframe before and of the one after [m]. distance: as measured, sigma: its standard deviation [m]. loud:
+whether the ranges scatter more than the radio does.
+"""
 
 
 class _Heard(NamedTuple):
@@ -65,11 +65,11 @@ class RangeMeans:
 
     Attributes:
       sigma_n: standard deviation of a range [m].
-      means: see there. pairs: newest ranges between two beacons at rest, by their nodes.
+      means: rows of MEAN. pairs: newest ranges between two beacons at rest, by their nodes.
     """
 
     sigma_n: float
-    means: list[Mean] = field(default_factory=list)
+    means: Column = field(default_factory=lambda: Column(dtype=MEAN))
     pairs: dict[tuple[Node, Node], deque[float]] = field(default_factory=dict)
     _places: dict[int, int] = field(default_factory=dict)
     _newest: dict[int, deque[float]] = field(default_factory=dict)
@@ -78,7 +78,7 @@ class RangeMeans:
     def copy(self) -> RangeMeans:
         """The means and pairs there are now; what is added later does not change them."""
         pairs = {pair: deque(kept) for pair, kept in self.pairs.items()}
-        return RangeMeans(self.sigma_n, list(self.means), pairs)
+        return RangeMeans(self.sigma_n, self.means.copy(), pairs)
 
     def node(self, slot: int) -> Node:
         """The place where a beacon rests now."""
@@ -89,10 +89,10 @@ class RangeMeans:
         self._places[slot] = self._places.get(slot, 0) + 1
         self._newest.pop(slot, None)
 
-    def forget(self, slot: int, before: Callable[[Mean], bool]) -> None:
-        """Leave out some of the means of a beacon's present place: it may have been elsewhere then."""
-        node = self.node(slot)
-        self.means = [mean for mean in self.means if mean.node != node or not before(mean)]
+    def forget(self, slot: int, before: int) -> None:
+        """Leave out the means of a beacon's present place from before a keyframe: it may have been elsewhere then."""
+        rows, (_, place) = self.means.values, self.node(slot)
+        self.means.keep((rows["slot"] != slot) | (rows["place"] != place) | (rows["at"] >= before))
 
     def hear(
         self, frame: StampedFrame, estimate: Estimate, pose: np.ndarray, params: Params, nlos_gap_db: float
@@ -137,14 +137,16 @@ class RangeMeans:
             halves: dict[bool, list[_Heard]] = defaultdict(list)
             for one in heard:
                 halves[one.stamp - stamps[0] >= span / 2].append(one)
-            self.means += map(partial(self._mean, at, node, stamps[0], span, poses, scatter), halves.values())
+            for some in halves.values():
+                self.means.append((at, *node, *self._mean(stamps[0], span, poses, scatter, some)))
         self.drop()
 
     def drop(self) -> None:
         """Leave out what was heard since the last keyframe."""
         self._open.clear()
 
-    def _mean(self, at, node, start, span, poses, scatter, heard: list[_Heard]) -> Mean:
+    def _mean(self, start, span, poses, scatter, heard: list[_Heard]) -> tuple:
+        """The fields of MEAN from the share on."""
         middle = sorted(one.distance for one in heard)[len(heard) // 2]  # one of them, so at least one is near it
         ok = [one for one in heard if abs(one.distance - middle) < _WILD_M]
         stamp, *antenna, distance = (sum(column) / len(ok) for column in zip(*ok, strict=True))
@@ -152,4 +154,4 @@ class RangeMeans:
         before, after = (turned(-pose[2], np.array(antenna) - pose[:2]) for pose in poses)
         sigma = mean_sigma(len(ok), scatter, self.sigma_n)
         loud = sigma > mean_sigma(1, self.sigma_n, self.sigma_n)
-        return Mean(at, node, share, before, after, distance, sigma, loud)
+        return (share, before, after, distance, sigma, loud)

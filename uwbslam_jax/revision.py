@@ -16,7 +16,7 @@ import numpy as np
 
 from uwbslam_jax import layout
 from uwbslam_jax.config import Config, Params
-from uwbslam_jax.graph import Graph, Keyframe, relative, wrapped
+from uwbslam_jax.graph import Graph, relative, wrapped
 from uwbslam_jax.grid import Grid
 from uwbslam_jax.hindsight import Question, framed_solution
 from uwbslam_jax.multilateration import SIGMA_ENOUGH_M
@@ -44,9 +44,8 @@ _FLOOR_M = 0.01
 
 
 class Revision(NamedTuple):
-    """The run until some keyframe, solved and drawn: keyframes (N,), their poses, the map."""
+    """The run until some keyframe, solved and drawn."""
 
-    keyframes: list[Keyframe]
     solution: Solution
     grid: Grid
     tiles: Tiles
@@ -67,7 +66,7 @@ class _Job:
         tiles, graph = Tiles(self.resolution), self.question.graph
         seen = graph.seen(solution.poses)
         grid = redraw(self.config, self.params, tiles, seen, solution.poses[-1, :2], self.epoch)
-        return Revision(graph.keyframes, solution, grid, tiles)
+        return Revision(solution, grid, tiles)
 
 
 @dataclass
@@ -92,10 +91,10 @@ class Reviser:
         self._begun_with, self._due = len(question.graph.keyframes), _LOOKS
         self._running = self._pool.submit(framed_solution, question)
 
-    def look(self, news: Callable[[list[Keyframe], Solution], bool]) -> Revision | None:
+    def look(self, news: Callable[[Solution], bool]) -> Revision | None:
         """The revision that is due at this look of the host; waited for if need be.
 
-        news: whether a solution of these keyframes contradicts the state. Only such a one is drawn.
+        news: whether a solution contradicts the state. Only such a one is drawn.
         """
         if self._running is None or self._job is None or self._pool is None:
             return None
@@ -104,9 +103,9 @@ class Reviser:
             return None
         found, self._running = self._running.result(), None
         if isinstance(found, Revision):
-            return found if news(found.keyframes, found.solution) else None
+            return found if news(found.solution) else None
         self.solved += found is not None
-        if found is not None and news(self._job.question.graph.keyframes, found):
+        if found is not None and news(found):
             self._running, self._due = self._pool.submit(self._job.draw, found), _LOOKS
         return None
 
@@ -124,15 +123,16 @@ class Reviser:
             self._pool = None
 
 
-def is_news(keyframes: list[Keyframe], solution: Solution, state: State, graph: Graph, *, learnt: bool) -> bool:
+def is_news(solution: Solution, state: State, graph: Graph, *, learnt: bool) -> bool:
     """Whether a solution contradicts the state: a beacon stands elsewhere, or the map was drawn elsewhere.
 
     One that ends before the robot was carried off cannot be carried on to now, and is none.
 
     Args:
-      keyframes: those that were solved. learnt: whether biases are known already.
+      learnt: whether biases are known already.
     """
-    if any(key.broken for key in graph.keyframes[len(keyframes) :]):
+    count = len(solution.poses)
+    if graph.keyframes["broken"][count:].any():
         return False
     slots, places, at = _current(solution, graph)
     if len(slots) < 2:
@@ -145,18 +145,17 @@ def is_news(keyframes: list[Keyframe], solution: Solution, state: State, graph: 
         off = place - mean[two]
         if np.linalg.norm(off) > _NEWS_M and off @ np.linalg.solve(P[two, two] + solution.cov[own, own], off) > _NEWS:
             return True
-    drawn = np.array([key.pose for key in graph.keyframes[: len(solution.poses)]])
-    off = np.linalg.norm(solution.poses[:, :2] - drawn[:, :2], axis=1)
+    off = np.linalg.norm(solution.poses[:, :2] - graph.poses()[:count, :2], axis=1)
     return bool(np.sqrt(np.mean(off**2)) > _NEWS_M)
 
 
 def take_over(config: Config, params: Params, revision: Revision, state: State, graph: Graph) -> State:
     """The state with pose, beacons and map as a revision has them, carried on to now; the graph's keyframes are moved
     with the map."""
-    solution, count = revision.solution, len(revision.keyframes)
+    solution, count = revision.solution, len(revision.solution.poses)
     slots, places, at = _current(solution, graph)
-    onward = relative(graph.keyframes[count - 1].pose, graph.poses())
-    poses = np.concatenate([solution.poses, compose(solution.poses[-1], onward[count:])])
+    last = graph.poses()[count - 1]
+    poses = np.concatenate([solution.poses, compose(solution.poses[-1], relative(last, graph.poses()[count:]))])
     grid = revision.grid
     way = float(state.map_spread.way)
     for pose, snapshot in graph.seen(poses, count):
@@ -164,7 +163,7 @@ def take_over(config: Config, params: Params, revision: Revision, state: State, 
     s = layout.unpack(state.belief.mean)
     old = np.asarray(layout.robot_pose(state.belief.mean), float)
     on_map = old + np.asarray(s.map_error, float)
-    pose = compose(solution.poses[-1], relative(graph.keyframes[count - 1].pose, on_map))
+    pose = compose(solution.poses[-1], relative(last, on_map))
     pose[2] = old[2] + wrapped(pose[2] - old[2])
     cov = _cov(solution, at, pose, float(np.sum(np.hypot(*np.diff(poses[count - 1 :, :2], axis=0).T))))
     others = [slot for slot in map(int, np.flatnonzero(np.asarray(state.active))) if slot > 0 and slot not in slots]

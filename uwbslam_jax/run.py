@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import time
+from array import array
 from collections.abc import Callable, Iterable
 from types import TracebackType
 
@@ -71,7 +72,7 @@ class Runner:
         self._group = 1 if online else CONTROL_EVERY
         self._clock = clock
         self._waiting: list[StampedFrame] = []
-        self._step_ms: list[float] = []
+        self._step_ms = array("f")
         self._links = Links()
 
     def know(self, slots: dict[int, int]) -> None:
@@ -134,7 +135,7 @@ class Runner:
         begin, compiled = time.perf_counter(), self._clock.seconds
         estimates = [self.session.step(frames[0])] if self._group == 1 else self.session.steps(frames)
         seconds = time.perf_counter() - begin - (self._clock.seconds - compiled)
-        self._step_ms += [max(seconds, 0.0) * 1e3 / len(frames)] * len(frames)
+        self._step_ms.extend([max(seconds, 0.0) * 1e3 / len(frames)] * len(frames))
         if self.session.status == "waiting for motion":
             for frame in frames:
                 self._links.hear(frame, self.session.params, self.session.config.nlos_gap_db)

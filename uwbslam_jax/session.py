@@ -202,7 +202,7 @@ class Session:
         solution = self.hindsight.solution
         seen = self.graph.seen(solution.poses)
         grid = redraw(self.config, self.params, self.tiles, seen, self.hindsight.track[-1, :2])
-        self._take_over(Revision(self.graph.keyframes, solution, grid, self.tiles))
+        self._take_over(Revision(solution, grid, self.tiles))
 
     def _question(self) -> Question | None:
         """What to solve of the run so far."""
@@ -213,7 +213,7 @@ class Session:
         places = self._places | {
             self.graph.ranges.node(slot): positions[slot] for slot in map(int, np.flatnonzero(resting)) if slot > 0
         }
-        poses = self.history.poses[[key.frame for key in self.graph.keyframes]]
+        poses = self.history.poses[self.graph.keyframes["frame"]].astype(float)
         configured = make_params(self.settings, self._slots)
         return Question(self.graph.copy(), poses, places, configured, self._frame_nodes, bool(self.found_bias))
 

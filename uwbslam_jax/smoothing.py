@@ -115,22 +115,24 @@ class Problem:
 
     @staticmethod
     def build(graph: Graph, poses, places, height, bias, bias_scale) -> Problem | None:
-        heard: dict[Node, int] = {}
-        for mean in graph.ranges.means:
-            heard[mean.node] = heard.get(mean.node, 0) + 1
-        nodes = sorted(node for node, n in heard.items() if n >= _FEWEST_MEANS and node in places)
+        means = graph.ranges.means.values
+        found, which, heard = np.unique(means[["slot", "place"]], return_inverse=True, return_counts=True)
+        number = np.full(len(found), -1)
+        nodes: list[Node] = []
+        for k, node in enumerate(found.tolist()):
+            if heard[k] >= _FEWEST_MEANS and node in places:
+                number[k] = len(nodes)
+                nodes.append(node)
         if len(graph.keyframes) < 3 or not nodes:
             return None
         index = {node: b for b, node in enumerate(nodes)}
         slots = [0, *sorted({slot for slot, _ in nodes})]
-        means = [mean for mean in graph.ranges.means if mean.node in index]
-        slot = np.array([mean.node[0] for mean in means])
-        sigma = np.array([mean.sigma for mean in means])
-        loud = np.array([mean.loud for mean in means])
-        to = np.array([index[mean.node] for mean in means])
+        to = number[which]
+        means, to = means[to >= 0], to[to >= 0]
+        slot, loud = means["slot"], means["loud"]
         # a wall makes all of its ranges too long: many of them tell no more than one
         walled = np.bincount(to[loud], minlength=len(nodes))
-        sigma = np.where(loud, sigma * np.sqrt(np.maximum(walled[to], 1)), sigma)
+        sigma = means["sigma"] * np.where(loud, np.sqrt(np.maximum(walled[to], 1)), 1.0)
         pairs = []
         for (a, b), kept in graph.ranges.pairs.items():
             if a in index and b in index and len(kept) >= 3:
@@ -140,23 +142,23 @@ class Problem:
                 d = (middle - bias[a[0]] - bias[b[0]]) / (1 + bias_scale)
                 s = mean_sigma(0.64 * len(values), scatter, graph.ranges.sigma_n)
                 pairs.append((index[a], index[b], d, height[a[0]] - height[b[0]], s))
-        old, new, between, roots, soft = steps(graph, poses)
+        way = steps(graph, poses)
         return Problem(
             len(graph.keyframes),
             nodes,
             slots,
-            old,
-            new,
-            between,
-            roots,
-            soft,
+            way.old,
+            way.new,
+            way.between,
+            way.roots,
+            way.soft,
             even_drive(graph),
-            np.array([mean.at for mean in means]),
+            means["at"],
             to,
-            np.array([mean.share for mean in means]),
-            np.array([mean.before for mean in means]),
-            np.array([mean.after for mean in means]),
-            (np.array([mean.distance for mean in means]) - bias[0] - bias[slot]) / (1 + bias_scale),
+            means["share"].astype(float),
+            means["before"].astype(float),
+            means["after"].astype(float),
+            (means["distance"].astype(float) - bias[0] - bias[slot]) / (1 + bias_scale),
             height[0] - height[slot],
             sigma,
             np.array([p[:2] for p in pairs], int).reshape(-1, 2),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from uwbslam_jax.graph import Graph, relative, wrapped
@@ -24,55 +26,69 @@ _FEWEST_STEPS = 20
 """So many steps tell how evenly a robot drives."""
 
 
-def steps(graph: Graph, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+class Steps(NamedTuple):
+    """Keyframes relative to older ones, E of them.
+
+    Attributes:
+      old, new: (E,) numbers of the keyframes. between: (E, 3) pose of the new one in the frame of the old one.
+      roots: (E, 3, 3) of their information, of which each is root.T @ root. soft: (E,) whether one may be wrong.
+    """
+
+    old: np.ndarray
+    new: np.ndarray
+    between: np.ndarray
+    roots: np.ndarray
+    soft: np.ndarray
+
+
+def steps(graph: Graph, poses: np.ndarray) -> Steps:
     """Steps between consecutive keyframes, which bound what nothing measured, then the scans laid over older ones.
 
     Args:
       poses: (N, 3) about where the keyframes are. An edge far from them is left out: before the frame is decided
         nothing tells that a robot moves along a corridor, and its scans are laid over others of the same look.
-
-    Returns:
-      old, new (E,) keyframes, between (E, 3), roots (E, 3, 3) of their information, soft (E,) whether one may be wrong.
     """
-    keys = graph.keyframes
-    old, new, between, roots, soft = [], [], [], [], []
-    for k in range(1, len(keys)):
-        if keys[k].broken:
-            continue
-        wheels = keys[k].wheels
-        z = relative(keys[k - 1].pose, keys[k].pose) if wheels is None else wheels
-        elapsed = min((keys[k].stamp - keys[k - 1].stamp) / 1e9, _LONGEST_S) if wheels is None else 0.0
-        sigma = _sigma(z, _LOOSE if wheels is None else _LOOSE_WHEELS) + np.array([elapsed, elapsed, 0.0])
-        old.append(k - 1)
-        new.append(k)
-        between.append(z)
-        roots.append(np.diag(1 / sigma))
-        soft.append(False)
-        if not (keys[k - 1].blind or keys[k].blind):
-            z = relative(keys[k - 1].pose, keys[k].pose)
-            old.append(k - 1)
-            new.append(k)
-            between.append(z)
-            roots.append(np.diag(1 / _sigma(z, _MATCHED)))
-            soft.append(True)
-    for edge in graph.edges:
-        off = relative(poses[edge.old], poses[edge.new]) - edge.between
-        if np.hypot(*off[:2]) > _ASTRAY[0] or abs(wrapped(off[2])) > _ASTRAY[1]:
-            continue
-        values, vectors = np.linalg.eigh(edge.information)
-        old.append(edge.old)
-        new.append(edge.new)
-        between.append(edge.between)
-        roots.append(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T)
-        soft.append(True)
-    return np.array(old), np.array(new), np.array(between), np.array(roots), np.array(soft)
+    keys = graph.keyframes.values
+    new = np.flatnonzero(~keys["broken"][1:]) + 1
+    stamp, matched = keys["stamp"] / 1e9, relative(keys["pose"][new - 1], keys["pose"][new])
+    rolled = graph.rolled()[new, None]
+    z = np.where(rolled, keys["wheels"][new], matched)
+    elapsed = np.minimum(stamp[new] - stamp[new - 1], _LONGEST_S)[:, None] * np.array([1.0, 1.0, 0.0])
+    loose = np.where(rolled, _sigma(z, _LOOSE_WHEELS), _sigma(z, _LOOSE) + elapsed)
+    sees = ~graph.blind()
+    tight = sees[new - 1] & sees[new]
+    sure, edges = matched[tight], _near(graph.edges.values, poses)
+    values, vectors = np.linalg.eigh(edges["information"].astype(float))
+    roots = [
+        _diagonal(1 / loose),
+        _diagonal(1 / _sigma(sure, _MATCHED)),
+        np.sqrt(np.maximum(values, 0.0))[:, :, None] * vectors.swapaxes(1, 2),
+    ]
+    return Steps(
+        np.concatenate([new - 1, new[tight] - 1, edges["old"]]),
+        np.concatenate([new, new[tight], edges["new"]]),
+        np.concatenate([z, sure, edges["between"]]),
+        np.concatenate(roots),
+        np.arange(len(z) + len(sure) + len(edges)) >= len(z),
+    )
+
+
+def _near(edges: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """The edges that are not far from where the keyframes are."""
+    off = relative(poses[edges["old"]], poses[edges["new"]]) - edges["between"]
+    return edges[(np.hypot(off[:, 0], off[:, 1]) <= _ASTRAY[0]) & (np.abs(wrapped(off[:, 2])) <= _ASTRAY[1])]
+
+
+def _diagonal(values: np.ndarray) -> np.ndarray:
+    """Diagonal matrices (n, 3, 3) of rows (n, 3)."""
+    return values[:, :, None] * np.eye(3)
 
 
 def _sigma(step: np.ndarray, loose: tuple[float, float, float, float]) -> np.ndarray:
-    """Standard deviation of a step (3,) by its length and its turn [m, m, rad]."""
+    """Standard deviation of steps (n, 3) by their lengths and turns [m, m, rad]."""
     floor, share, floor_yaw, share_yaw = loose
-    along = floor + share * np.hypot(*step[:2])
-    return np.array([along, along, floor_yaw + share_yaw * abs(wrapped(step[2]))])
+    along = floor + share * np.hypot(step[:, 0], step[:, 1])
+    return np.stack([along, along, floor_yaw + share_yaw * np.abs(wrapped(step[:, 2]))], axis=-1)
 
 
 def even_drive(graph: Graph) -> np.ndarray:
@@ -81,13 +97,11 @@ def even_drive(graph: Graph) -> np.ndarray:
 
     How much it does change is learnt where scans tell: some robots drive evenly, some do not.
     """
-    keys = graph.keyframes
+    keys = graph.keyframes.values
     if len(keys) < 3:
         return np.zeros((0, 5))
-    stamp = np.array([key.stamp for key in keys]) / 1e9
-    pose = np.array([key.pose for key in keys])
-    open_way = np.array([key.broken or key.wheels is not None for key in keys])
-    blind = np.array([key.blind for key in keys])
+    stamp, pose = keys["stamp"] / 1e9, keys["pose"]
+    open_way, blind = keys["broken"] | graph.rolled(), graph.blind()
     dt = np.maximum(np.diff(stamp), 1e-3)
     step = np.diff(pose, axis=0)
     turn = 0.5 * (wrapped(step[:-1, 2]) + wrapped(step[1:, 2]))

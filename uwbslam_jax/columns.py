@@ -1,0 +1,59 @@
+"""Rows that are appended one at a time while a run goes on, kept as compactly as an array can.
+
+A run of hours keeps millions of small things; as objects of their own they would take ten times the room, and leave
+the heap in pieces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+_LEAST = 64
+
+
+class Column:
+    """Rows of one shape or one structured type, in one array that is doubled when it is full."""
+
+    def __init__(self, shape: tuple[int, ...] = (), dtype: np.typing.DTypeLike = np.float32):
+        self._rows = np.empty((_LEAST, *shape), dtype)
+        self._count = 0
+
+    def append(self, row) -> None:
+        """One more row at the end; a tuple where the type is structured."""
+        if self._count == len(self._rows):
+            # what is not written to yet takes no memory of the system
+            rows = np.empty((max(_LEAST, 2 * self._count), *self._rows.shape[1:]), self._rows.dtype)
+            rows[: self._count] = self._rows
+            self._rows = rows
+        self._rows[self._count] = row
+        self._count += 1
+
+    def keep(self, which: np.ndarray) -> None:
+        """Leave out all rows but those of a mask (n,)."""
+        self._rows = self.values[which]
+        self._count = len(self._rows)
+
+    def copy(self) -> Column:
+        """The rows there are now; what happens to these later does not change them."""
+        other = Column(self._rows.shape[1:], self._rows.dtype)
+        other._rows, other._count = self.values.copy(), self._count
+        return other
+
+    @property
+    def values(self) -> np.ndarray:
+        """All rows so far, a view."""
+        return self._rows[: self._count]
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, index):
+        return self.values[index]
+
+    def __iter__(self) -> Iterator:
+        return iter(self.values)
+
+    def __array__(self, dtype=None, copy=None) -> np.ndarray:
+        return np.array(self.values, dtype)
