@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from uwbslam_jax import __version__
+from uwbslam_jax import __version__, memory
 
 COMMANDS = {
     "demo": "simulate a robot in a workshop, run the recording, and report",
@@ -84,6 +84,7 @@ def prepare() -> None:
     # the same holds for XLA's kernels of a step, each of which takes microseconds
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
     os.environ.setdefault("NPROC", "1")  # size of XLA's own thread pool
+    memory.few_arenas()
 
 
 def usage() -> str:

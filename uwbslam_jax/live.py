@@ -5,7 +5,6 @@ Devices and recorder have threads of their own; one loop takes messages in the o
 
 from __future__ import annotations
 
-import ctypes
 import gc
 import sys
 import threading
@@ -19,7 +18,7 @@ import numpy as np
 
 from uwbslam_drivers import Source, open_source
 from uwbslam_drivers.clock import host_time
-from uwbslam_jax import saved_state
+from uwbslam_jax import memory, saved_state
 from uwbslam_jax.config import Settings
 from uwbslam_jax.findings import Facts
 from uwbslam_jax.inbox import Arrival, Inbox
@@ -89,13 +88,6 @@ class Devices:
             for name, source in self.sources.items()
             if source.status != "streaming"
         ]
-
-
-def give_back_memory() -> None:
-    """Hands memory that is free to the system: what threads allocate by turns is kept in ever more pieces otherwise."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # of glibc
-    if trim is not None:
-        trim(0)
 
 
 class LiveRun:
@@ -241,7 +233,7 @@ class LiveRun:
             saved_state.save(saved, self.recording.parent)
         except OSError as error:  # a full disk must not end the run
             self._recorder.failure = self._recorder.failure or f"{saved_state.FILE}: {error.strerror or error}"
-        give_back_memory()
+        memory.give_back()
 
     def _dropped(self) -> Counter[str]:
         counts: Counter[str] = self._inbox.dropped + self._not_located

@@ -22,6 +22,7 @@ from uwbslam_jax.geometry import rotation, safe_norm, transform_points, wrap_ang
 from uwbslam_jax.grid import Grid, Sweep
 from uwbslam_jax.matching import Match
 from uwbslam_jax.measurements import Frame, Scan
+from uwbslam_jax.seldom import seldom
 
 _KNOWN_ENOUGH = 0.25
 """Share of returns on observed cells below which a score says nothing: the robot looks at new ground."""
@@ -272,16 +273,18 @@ def _match(config, params, state, belief, sweep, surface, has_scan) -> tuple[Mat
     searchable = jnp.where(match.known > _KNOWN_ENOUGH, ~fits, unsure & (state.scans_drawn > _DRAW_FIRST))
     wanted = has_scan & searchable & (jnp.sum(sweep.valid) > _FEWEST_RETURNS)
 
-    def wide(_):
-        likely = prior._replace(cov=prior.cov - jnp.diag(jnp.array(_ALIGN_FLOOR) ** 2) * 0.75)
-        last = C @ state.belief.mean
-        found = matching.search(
-            state.grid, sweep, surface, likely, (last, match.pose), params.sigma_l, config.resolution
-        )
-        found = lax.stop_gradient(found)  # a choice among places
+    def wide(found, grid, sweep, surface, likely, last, sigma_l):
+        return matching.search(grid, sweep, surface, likely, (last, found), sigma_l, config.resolution)
+
+    likely = prior._replace(cov=prior.cov - jnp.diag(jnp.array(_ALIGN_FLOOR) ** 2) * 0.75)
+    last = C @ state.belief.mean
+    # a choice among places: held in a derivative
+    found = seldom(wanted, wide, match.pose, state.grid, sweep, surface, likely, last, params.sigma_l)
+
+    def assessed(_):
         return matching.assess(state.grid, sweep, surface, found, config.resolution)
 
-    return lax.cond(wanted, wide, lambda _: match, None), wanted
+    return lax.cond(wanted, assessed, lambda _: match, None), wanted
 
 
 def _draw(config, state, matched: _Matched, sweep, surface) -> tuple[State, Bool[Array, ""]]:
@@ -294,7 +297,7 @@ def _draw(config, state, matched: _Matched, sweep, surface) -> tuple[State, Bool
     turned = jnp.abs(wrap_angle(pose[2] - state.drawn_pose[2])) > _DRAW_MOVED[1]
     wanted = matched.trusted & (moved | turned | (state.scans_drawn < _DRAW_FIRST))
 
-    def drawn(state: State) -> State:
+    def anchored(_):
         new = _on_new_ground(config, state.grid, sweep, pose)
         novelty = jnp.sum(new) / jnp.maximum(jnp.sum(sweep.valid), 1)
         limit = jnp.array([_DRAW_PULL[0], _DRAW_PULL[0], _DRAW_PULL[1]])
@@ -304,15 +307,22 @@ def _draw(config, state, matched: _Matched, sweep, surface) -> tuple[State, Bool
         share = jnp.zeros((3, 3)).at[2, 2].set(novelty).at[:2, :2].set(walls)
         share = jnp.where(_map_errs(config, state), share, 0.0)
         way = safe_norm(pose[:2] - state.drawn_pose[:2])
-        return state._replace(
-            belief=trust.anchor(state.belief, at, share),
-            map_spread=trust.learn_spread(state.map_spread, state.belief, share, way),
-            grid=occupancy.integrate(state.grid, at, sweep, config.resolution, state.map_spread.way),
-            drawn_pose=pose,
-            scans_drawn=state.scans_drawn + 1,
-        )
+        spread = trust.learn_spread(state.map_spread, state.belief, share, way)
+        return at, trust.anchor(state.belief, at, share), spread
 
-    return lax.cond(wanted, drawn, lambda state: state, state), wanted
+    def draw(grid, at, sweep, way):
+        return occupancy.integrate(grid, at, sweep, config.resolution, way)
+
+    kept = state.drawn_pose, state.belief, state.map_spread
+    at, belief, spread = lax.cond(wanted, anchored, lambda _: kept, None)
+    state = state._replace(
+        belief=belief,
+        map_spread=spread,
+        grid=seldom(wanted, draw, state.grid, at, sweep, state.map_spread.way),
+        drawn_pose=jnp.where(wanted, pose, state.drawn_pose),
+        scans_drawn=state.scans_drawn + wanted,
+    )
+    return state, wanted
 
 
 def _map_errs(config, state):
