@@ -12,8 +12,8 @@ DRIVERS = Path(__file__).parents[1] / "drivers" / "uwbslam_drivers"
 
 # Numbers between whole ones are parts of the floor below them that stand on each other.
 FLOORS: dict[float, str] = {
-    0: "__init__",
-    1: "geometry measurements config ekf result layout mcap_records packing paths rays sparse_rows",
+    0: "__init__ memory",
+    1: "geometry measurements config ekf result layout mcap_records packing paths rays sparse_rows columns seldom",
     2: "motion ranging grid metrics settings_file frames ros_types worlds multilateration inbox",
     2.05: "keyframes bag",
     2.1: "sightings placement relative schemas result_log conditions",

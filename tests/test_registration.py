@@ -9,7 +9,7 @@ import small_room as room
 
 from uwbslam_jax.config import Settings, make_params
 from uwbslam_jax.measurements import Snapshot
-from uwbslam_jax.registration import Registration, register
+from uwbslam_jax.registration import Registration, register, view
 
 PARAMS = make_params(Settings())
 BEAMS = 360
@@ -32,8 +32,8 @@ def relative(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def laid(old: Snapshot, new: Snapshot, guess: np.ndarray) -> Registration:
-    stacked = jax.tree.map(lambda leaf: np.asarray(leaf)[None], old)
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[0], register(PARAMS, stacked, new, np.float32(guess[None])))
+    stacked = jax.tree.map(lambda leaf: np.asarray(leaf)[None], view(PARAMS, old))
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[0], register(stacked, view(PARAMS, new), np.float32(guess[None])))
 
 
 @pytest.mark.parametrize("off", [(0.0, 0.0, 0.0), (0.25, -0.2, 0.08), (-0.3, 0.1, -0.08)])

@@ -167,6 +167,22 @@ def test_memory_is_bounded_and_one_node_can_be_forgotten():
     assert set(heard.since(0.0)[:, s.OTHER]) == {0, 2}
 
 
+def test_several_nodes_are_looked_at_together_as_each_by_itself():
+    places = PLACES[3]
+    made = {
+        3: rows(lambda t: places, at_rest, 1.0, seed=1),
+        4: rows(lambda t: PLACES[4] + np.array([0.9 * t, 0.0]), at_rest, 1.0, seed=2),
+        2: rows(lambda t: PLACES[2], at_rest, 0.1, others=(1,), seed=3),
+        1: rows(lambda t: PLACES[1] + np.array([0.6, 0.0]), at_rest, 1.0, others=(2,), seed=4),
+    }
+    noise, velocities = np.full((5, 5), 0.1), np.zeros((5, 2))
+    assert s.calm(made, known(1.0), noise, velocities) == {3, 2}  # of node 2 there is too little to tell
+    velocities[4] = [0.9, 0.0]
+    carried = {4: rows(lambda t: PLACES[4] + np.array([0.9 * (t - 1.0), 0.0]), at_rest, 1.0, seed=2)}
+    assert s.calm(carried, known(1.0), noise, velocities) == {4}
+    assert s.calm({}, known(1.0), noise, velocities) == set()
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_what_is_taken_for_noise_at_first_sight_would_be_found_to_fit(seed, monkeypatch):
     """The cheap question spares the dear one, and answers as it does; what moves or is biased is never noise."""
@@ -181,5 +197,5 @@ def test_what_is_taken_for_noise_at_first_sight_would_be_found_to_fit(seed, monk
         verdict = s.judge(made, known(1.0), 3, np.zeros(2))
         assert (not asked) == noise
         assert verdict.fits or not noise
-    monkeypatch.setattr(s, "_is_noise", lambda *a: False)
+    monkeypatch.setattr(s, "_is_noise", lambda *a: [False])
     assert s.judge(resting, known(1.0), 3, np.zeros(2)).fits

@@ -7,12 +7,12 @@ to be carried, until they say that it rests; one that is not heard for long leav
 
 from __future__ import annotations
 
+import statistics
 from dataclasses import dataclass, field
 
-import jax
 import numpy as np
 
-from uwbslam_jax import beacon_state, layout, ranging
+from uwbslam_jax import beacon_state, ranging
 from uwbslam_jax.config import Params, Settings
 from uwbslam_jax.heard import Heard, heard
 from uwbslam_jax.measurements import StampedFrame
@@ -25,6 +25,7 @@ from uwbslam_jax.sightings import (
     Known,
     Sightings,
     Verdict,
+    calm,
     carried_place,
     judge,
     resting_elsewhere,
@@ -58,8 +59,9 @@ but not from one other place for long."""
 _NEWEST = 4
 """So many of a beacon's newest ranges place a robot that was carried."""
 
+_WATCHED = ("static", "moving", "silent")
+
 Event = tuple[int, str]
-_loudness = jax.jit(ranging.loudness)
 
 
 @dataclass
@@ -80,11 +82,14 @@ class _Copied:
     def __init__(self, state: State, sigma_n: float):
         k = state.active.shape[0]
         self.of = state
-        self.places = np.asarray(state.belief.mean, float)[: 2 * k].reshape(k, 2)
+        places, velocities = np.asarray(state.belief.mean, float)[: 4 * k].reshape(2, k, 2)
+        self.places = places
         self.variance = np.max(np.diag(np.asarray(state.belief.cov, float))[: 2 * k].reshape(k, 2), axis=1)
         self.variance[0] = 0.0  # the robot's track is taken as a whole, see beacon_state.place
         self.rests = np.asarray(state.active) & ~np.asarray(state.moving)
-        self.noise = sigma_n * np.asarray(_loudness(state.scatter.log), float)
+        self.noise = sigma_n * ranging.loudness(np.asarray(state.scatter.log, float), np)
+        self.velocities = np.where(np.asarray(state.moving)[:, None], velocities, 0.0)
+        self.calm: tuple[tuple[float, list[int]], set[int]] | None = None  # when, and with whom doubted
 
 
 class BeaconKeeper:
@@ -145,9 +150,24 @@ class BeaconKeeper:
         if self._copied is None or self._copied.of is not state:
             self._copied = _Copied(state, self._sigma_n)
         trusted = self._copied.rests.copy()
-        trusted[[slot for slot, life in self._lives.items() if life.doubted is not None]] = False
+        trusted[self._doubted()] = False
         noise = self._copied.noise[slot]
         return Known(self._copied.places, self._copied.variance, trusted, self._sigma_n, noise, now)
+
+    def _doubted(self) -> list[int]:
+        return [slot for slot, life in self._lives.items() if life.doubted is not None]
+
+    def _judge(self, known: Known, slot: int) -> Verdict:
+        """What a node's newest ranges say, see `judge`; all nodes are looked at together, for as long as nothing is
+        found about one. known: of the state that was copied last."""
+        copied, asked = self._copied, (known.now, self._doubted())
+        assert copied is not None
+        if copied.calm is None or copied.calm[0] != asked:
+            watched = {k: life.sightings for k, life in self._lives.items() if life.status in _WATCHED}
+            copied.calm = asked, calm(watched, known, copied.noise, copied.velocities)
+        if slot in copied.calm[1]:
+            return Verdict(True, None, np.zeros((0, 6)), 0.0)
+        return judge(self._lives[slot].sightings, known, slot, copied.velocities[slot])
 
     def _listen(self, ranges: Heard) -> None:
         """Remember each usable range to a node of known place."""
@@ -192,8 +212,7 @@ class BeaconKeeper:
             life.status = "waiting"
             events.append((slot, "fell silent while it was carried" if quiet > _SILENT_S else "was lost while carried"))
             return beacon_state.remove(state, slot)
-        velocity = np.asarray(layout.unpack(state.belief.mean).velocities[slot], float)
-        verdict = judge(life.sightings, known, slot, velocity)
+        verdict = self._judge(known, slot)
         if verdict.carried is not None:
             return beacon_state.place(state, slot, verdict.carried, verdict.rows, moving=True)
         return state
@@ -210,7 +229,7 @@ class BeaconKeeper:
             events.append((slot, "fell silent" if life.status == "silent" else "is heard again"))
         if life.status == "silent":
             return beacon_state.loosen(state, slot, _SILENT_WALK**2 * span)
-        verdict = judge(life.sightings, known, slot, np.zeros(2))
+        verdict = self._judge(known, slot)
         if verdict.carried is not None:
             self._enter(slot, life, "moving", known)
             events.append((slot, "is being carried"))
@@ -265,7 +284,7 @@ class BeaconKeeper:
             recent = recent[recent[:, OTHER] == 0]
             if len(recent) < 2:
                 continue
-            misfit.append(float(np.median(np.abs(recent[:, NORMALISED]))) > _MISFIT)
+            misfit.append(statistics.median(np.abs(recent[:, NORMALISED]).tolist()) > _MISFIT)
             rows.append(
                 np.column_stack([np.tile(known.places[slot], (len(recent), 1)), recent[:, DISTANCE]])[-_NEWEST:]
             )

@@ -22,13 +22,18 @@ class Column:
 
     def append(self, row) -> None:
         """One more row at the end; a tuple where the type is structured."""
-        if self._count == len(self._rows):
+        self.extend([row])
+
+    def extend(self, rows) -> None:
+        """Some more rows at the end."""
+        count = self._count + len(rows)
+        if count > len(self._rows):
             # what is not written to yet takes no memory of the system
-            rows = np.empty((max(_LEAST, 2 * self._count), *self._rows.shape[1:]), self._rows.dtype)
-            rows[: self._count] = self._rows
-            self._rows = rows
-        self._rows[self._count] = row
-        self._count += 1
+            longer = np.empty((max(_LEAST, 2 * count), *self._rows.shape[1:]), self._rows.dtype)
+            longer[: self._count] = self.values
+            self._rows = longer
+        self._rows[self._count : count] = rows
+        self._count = count
 
     def keep(self, which: np.ndarray) -> None:
         """Leave out all rows but those of a mask (n,)."""

@@ -5,6 +5,8 @@ A few numbers a frame in arrays, so that memory grows by about a hundred bytes a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from uwbslam_jax.columns import Column
@@ -84,38 +86,61 @@ class History:
         rows = self._diagnostics.values
         return {name: rows[name].astype(np.float32) for name in _DIAGNOSTICS.names or ()} if len(rows) else {}
 
-    def add(self, frame: StampedFrame, estimate: Estimate, hypotheses: int) -> None:
-        """Take in one step."""
-        self.stamps.append(frame.stamp)
-        self.poses.append(estimate.pose)
-        self.map_poses.append(map_pose(estimate))
-        self.sight.append(sight(estimate))
-        self.covs.append(estimate.pose_cov)
-        self.has_scan.append(frame.frame.has_scan)
-        r, active = frame.frame.ranges, estimate.active
-        used = estimate.weight > 0
-        believed = np.count_nonzero(estimate.weight > 0.25)
-        unused = np.flatnonzero(r.valid & ~used)
-        nlos = np.count_nonzero(active[r.i[unused]] & active[r.j[unused]])
-        told = (estimate.score, estimate.known, estimate.poor, estimate.searched, estimate.drawn, hypotheses)
-        counts = (np.count_nonzero(r.valid), believed, nlos, np.count_nonzero(used) - believed)
-        self._diagnostics.append((*told, np.count_nonzero(active) - 1, *counts))
-        for k in np.flatnonzero(used):
-            pair = int(r.i[k]), int(r.j[k])
-            if frame.stamp - self._residuals_at.get(pair, 0) > _RESIDUALS_EVERY_S * 1e9:
-                self._residuals_at[pair] = frame.stamp
-                self.residuals.append((frame.stamp, *pair, estimate.innovation[k]))
+    def add(self, seen: Sequence[tuple[StampedFrame, Estimate]], hypotheses: int) -> None:
+        """Take in a few steps."""
+        frames, estimates = zip(*seen, strict=True)
+
+        def of(name: str) -> np.ndarray:
+            return np.stack([getattr(estimate, name) for estimate in estimates])
+
+        stamps = [frame.stamp for frame in frames]
+        self.stamps.extend(stamps)
+        self.poses.extend(of("pose"))
+        self.map_poses.extend([map_pose(estimate) for estimate in estimates])
+        self.sight.extend([sight(estimate) for estimate in estimates])
+        self.covs.extend(of("pose_cov"))
+        self.has_scan.extend([frame.frame.has_scan for frame in frames])
+        i, j, valid = (
+            np.stack([getattr(frame.frame.ranges, name) for frame in frames]) for name in ("i", "j", "valid")
+        )
+        active, weight = of("active"), of("weight")
+        used, believed, row = weight > 0, np.count_nonzero(weight > 0.25, axis=1), np.arange(len(seen))[:, None]
+        walled = valid & ~used & active[row, i] & active[row, j]
+        told = {"match_score": of("score"), "known_share": of("known"), "poor_match": of("poor")}
+        told |= {"searched": of("searched"), "drawn": of("drawn"), "hypotheses": hypotheses}
+        told |= {"beacons": np.count_nonzero(active, axis=1) - 1, "ranges": np.count_nonzero(valid, axis=1)}
+        told |= {"ranges_used": believed, "ranges_nlos": np.count_nonzero(walled, axis=1)}
+        told |= {"ranges_doubted": np.count_nonzero(used, axis=1) - believed}
+        rows = np.empty(len(seen), _DIAGNOSTICS)
+        for name, values in told.items():
+            rows[name] = values
+        self._diagnostics.extend(rows)
+        self._add_residuals(stamps, used, i, j, of("innovation"))
+        first = len(self.stamps) - len(seen)
+        for k, (frame, estimate) in enumerate(seen):
+            self._follow(first + k, frame, estimate)
+
+    def _add_residuals(self, stamps: list[int], used: np.ndarray, i, j, innovation) -> None:
+        columns = (np.nonzero(used)[0], i[used], j[used], innovation[used])
+        for frame, *pair, residual in zip(*(column.tolist() for column in columns), strict=True):
+            stamp, pair = stamps[frame], tuple(pair)
+            if stamp - self._residuals_at.get(pair, 0) > _RESIDUALS_EVERY_S * 1e9:
+                self._residuals_at[pair] = stamp
+                self.residuals.append((stamp, *pair, residual))
+
+    def _follow(self, number: int, frame: StampedFrame, estimate: Estimate) -> None:
+        """The beacons' tracks, and what was last there."""
         if frame.stamp - self._tracks_at > _TRACK_EVERY_S * 1e9:
             self._tracks_at = frame.stamp
             for slot in np.flatnonzero(estimate.active[1:]) + 1:
                 x, y = estimate.beacons[slot]
                 sigma = float(np.sqrt(max(np.linalg.eigvalsh(estimate.beacon_covs[slot])[-1], 0.0)))
                 self.tracks.append((frame.stamp, slot, x, y, sigma))
-        if self._seen is None or (active != self._seen.active).any():
+        if self._seen is None or (estimate.active != self._seen.active).any():
             self._keep_beacons()
         self._seen = estimate
         if frame.frame.has_scan:
-            self.last_scan = (len(self.stamps) - 1, frame, estimate)
+            self.last_scan = (number, frame, estimate)
 
     def event(self, stamp: int, text: str) -> None:
         """Something worth telling happened."""

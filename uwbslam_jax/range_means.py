@@ -14,7 +14,7 @@ import numpy as np
 
 from uwbslam_jax.columns import Column
 from uwbslam_jax.config import Params
-from uwbslam_jax.keyframes import mean_sigma, turned
+from uwbslam_jax.keyframes import mean_sigma
 from uwbslam_jax.measurements import StampedFrame
 from uwbslam_jax.slam import Estimate
 
@@ -151,7 +151,13 @@ class RangeMeans:
         ok = [one for one in heard if abs(one.distance - middle) < _WILD_M]
         stamp, *antenna, distance = (sum(column) / len(ok) for column in zip(*ok, strict=True))
         share = min(max((stamp - start) / span, 0.0), 1.0)
-        before, after = (turned(-pose[2], np.array(antenna) - pose[:2]) for pose in poses)
+        before, after = (_within(pose.tolist(), *antenna) for pose in poses)
         sigma = mean_sigma(len(ok), scatter, self.sigma_n)
         loud = sigma > mean_sigma(1, self.sigma_n, self.sigma_n)
         return (share, before, after, distance, sigma, loud)
+
+
+def _within(pose: list[float], x: float, y: float) -> tuple[float, float]:
+    """A place in the frame of a pose [m]."""
+    c, s, dx, dy = math.cos(pose[2]), math.sin(pose[2]), x - pose[0], y - pose[1]
+    return c * dx + s * dy, c * dy - s * dx

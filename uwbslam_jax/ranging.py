@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import ModuleType
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from uwbslam_jax import ekf, layout
 from uwbslam_jax.config import Params
 from uwbslam_jax.geometry import perpendicular
-from uwbslam_jax.measurements import Ranges
+from uwbslam_jax.measurements import Leaf, Ranges
 
 _SOFT = 3.0
 """Normalised innovation at which a range weighs a quarter (Geman-McClure)."""
@@ -129,13 +130,14 @@ def quiet(nodes: int) -> Scatter:
     return Scatter(*(jnp.zeros((nodes, nodes), dtype) for dtype in (jnp.float32, jnp.float32, bool)))
 
 
-def loudness(log: Float[Array, "*m"]) -> Float[Array, "*m"]:
-    """How many times sigma_n the noise of a pair is by the log of its scatter; 1 for a quiet pair.
+def loudness(log: Float[Leaf, "*m"], xp: ModuleType = jnp) -> Float[Leaf, "*m"]:
+    """How many times sigma_n the noise of a pair is by the log of its scatter; 1 for a quiet pair. xp: numpy where the
+    host asks.
 
     It grows with the square of the scatter: what makes ranges jump (walls in between) also makes them too long, by
     an amount that nobody knows.
     """
-    return jnp.clip((jnp.exp(log) / _QUIET) ** 2, 1.0, _LOUDEST)
+    return xp.clip((xp.exp(log) / _QUIET) ** 2, 1.0, _LOUDEST)
 
 
 def learn_scatter(scatter: Scatter, ranges: Ranges, usable: Bool[Array, "M"], normalised: Float[Array, "M"]) -> Scatter:

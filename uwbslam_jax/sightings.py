@@ -7,6 +7,7 @@ where the other node is a beacon, its place is looked up when it is needed, beca
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -40,6 +41,7 @@ _SPEED_SIGMA = 0.1
 """A node is known to rest when its velocity is known this well and is not different from zero [m/s]."""
 _SLOW = 0.02
 _RECENT_S = 1.0
+_FEWEST_JUDGED = 5
 _CARRIED_SIGMA_M = 0.3
 _WALL_COST = 6.0
 """Log-likelihood that it costs to say that a wall has come between two nodes."""
@@ -234,7 +236,7 @@ def judge(sightings: Sightings, known: Known, slot: int, velocity: np.ndarray) -
     here = known.places[slot] + time[:, None] * velocity
     rests = not np.any(velocity)
     off = distance - np.linalg.norm(here - at, axis=1)
-    if len(rows) < 5 or _is_noise(here, at, off / sigma, sigma, time):
+    if len(rows) < _FEWEST_JUDGED or _is_noise(here, at, off / sigma, sigma, time, np.zeros(1, int))[0]:
         return Verdict(True, None, rows, 0.0)
     bias = float(np.median(off))
     as_it_is = misfit(here, at, distance, sigma)
@@ -254,18 +256,42 @@ def judge(sightings: Sightings, known: Known, slot: int, velocity: np.ndarray) -
     return Verdict(not (_decides(moved, rows) or _decides(biased, rows)), None, rows, bias)
 
 
-def _is_noise(here: np.ndarray, at: np.ndarray, whitened: np.ndarray, sigma: np.ndarray, time: np.ndarray) -> bool:
-    """Whether rows scatter about a place (R, 2) as their noise lets them, and neither another place, nor a velocity,
-    nor a bias could explain them much better: what it can gain is that of the linear problem. So much cheaper than to
-    fit them all that it is asked first."""
-    square = float(whitened @ whitened)
-    if square > len(whitened) + _NOISE * np.sqrt(2.0 * len(whitened)):
-        return False
+def calm(sightings: Mapping[int, Sightings], known: Known, noise: np.ndarray, velocities: np.ndarray) -> set[int]:
+    """Those of some slots of which `judge` would say at a glance that they are where the state has them, or have too
+    few ranges to tell. So much cheaper than to judge each that it is asked first.
+
+    Args:
+      known: of any node. noise: (K, K) of each pair's ranges, see Known [m]. velocities: (K, 2) of the nodes [m/s].
+    """
+    recent = {slot: _since(seen, known, _RECENT_S) for slot, seen in sightings.items()}
+    quiet = {slot for slot, rows in recent.items() if len(rows) < _FEWEST_JUDGED}
+    told = {slot: rows for slot, rows in recent.items() if slot not in quiet}
+    if not told:
+        return quiet
+    rows, counts = np.concatenate(list(told.values())), [len(rows) for rows in told.values()]
+    slot, other, time = np.repeat(list(told), counts), rows[:, OTHER].astype(int), rows[:, TIME] - known.now
+    sigma = np.sqrt(noise[slot, other] ** 2 + known.variance[slot] + known.variance[other])
+    here, at = known.places[slot] + time[:, None] * velocities[slot], anchors(rows, known)
+    off = rows[:, DISTANCE] - np.linalg.norm(here - at, axis=1)
+    fits = _is_noise(here, at, off / sigma, sigma, time, np.cumsum([0, *counts[:-1]]))
+    return quiet | {slot for slot, fit in zip(told, fits, strict=True) if fit}
+
+
+def _is_noise(
+    here: np.ndarray, at: np.ndarray, whitened: np.ndarray, sigma: np.ndarray, time: np.ndarray, first: np.ndarray
+) -> np.ndarray:
+    """(G,) whether rows scatter about a place (R, 2) as their noise lets them, and neither another place, nor a
+    velocity, nor a bias could explain them much better: what it can gain is that of the linear problem. Of several
+    nodes at once; first: (G,) where the rows of each begin."""
+    count = np.diff(np.append(first, len(whitened)))
+    square = np.add.reduceat(whitened**2, first)
     u = here - at
     u = u / np.maximum(np.sqrt((u**2).sum(1)), 1e-6)[:, None]
     J = np.column_stack([u, time[:, None] * u, np.ones(len(u))]) / sigma[:, None]
-    pull = J.T @ whitened
-    return float(pull @ np.linalg.solve(J.T @ J + 1e-6 * np.eye(5), pull)) < DECIDED
+    A = np.add.reduceat(J[:, :, None] * J[:, None, :], first)
+    pull = np.add.reduceat(J * whitened[:, None], first)
+    gain = np.sum(pull * np.linalg.solve(A + 1e-6 * np.eye(5), pull[:, :, None])[:, :, 0], axis=1)
+    return (square <= count + _NOISE * np.sqrt(2.0 * count)) & (gain < DECIDED)
 
 
 def resting_elsewhere(sightings: Sightings, known: Known, slot: int) -> tuple[Spot, np.ndarray] | None:
