@@ -14,7 +14,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from uwbslam_jax import layout
+from uwbslam_jax import layout, memory
 from uwbslam_jax.config import Config, Params
 from uwbslam_jax.graph import Graph, relative, wrapped
 from uwbslam_jax.grid import Grid
@@ -61,6 +61,12 @@ class _Job:
     resolution: float
     epoch: float
 
+    def solve(self) -> Solution | None:
+        """The run so far; what that took is handed back at once, and not whenever the allocator likes."""
+        solution = framed_solution(self.question)
+        memory.give_back()
+        return solution
+
     def draw(self, solution: Solution) -> Revision:
         """The map, with the scans where the solution has them."""
         tiles, graph = Tiles(self.resolution), self.question.graph
@@ -89,7 +95,7 @@ class Reviser:
         self._pool = self._pool or ThreadPoolExecutor(1, thread_name_prefix="revision")
         self._job = _Job(config, params, question, resolution, epoch)
         self._begun_with, self._due = len(question.graph.keyframes), _LOOKS
-        self._running = self._pool.submit(framed_solution, question)
+        self._running = self._pool.submit(self._job.solve)
 
     def look(self, news: Callable[[Solution], bool]) -> Revision | None:
         """The revision that is due at this look of the host; waited for if need be.
@@ -102,11 +108,12 @@ class Reviser:
         if self._due > 0:
             return None
         found, self._running = self._running.result(), None
+        job, self._job = self._job, None
         if isinstance(found, Revision):
             return found if news(found.solution) else None
         self.solved += found is not None
         if found is not None and news(found):
-            self._running, self._due = self._pool.submit(self._job.draw, found), _LOOKS
+            self._job, self._running, self._due = job, self._pool.submit(job.draw, found), _LOOKS
         return None
 
     def drop(self) -> None:
