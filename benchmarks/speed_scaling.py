@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 
 from benchmarks.metric import Metric, Report, exponent, ratio
-from uwbslam_jax import layout, session, slam
+from uwbslam_jax import compiled, layout, slam
 from uwbslam_jax.config import Config, LidarSettings, MapSettings, Settings, UwbSettings, make_config, make_params
 from uwbslam_jax.measurements import Frame, Ranges, Scan, empty_frame
 
@@ -100,7 +100,7 @@ class Case:
         """Seconds of one more step."""
         frame = self.frame()
         begin = time.perf_counter()
-        self.state, _ = session.step_once(self._config, self._params, self.state, frame)
+        self.state, _ = compiled.step_once(self._config, self._params, self.state, frame)
         jax.block_until_ready(self.state)
         return time.perf_counter() - begin
 

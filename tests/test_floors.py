@@ -23,7 +23,7 @@ FLOORS: dict[float, str] = {
     4: "matching",
     4.1: "paper trust",
     5: "slam",
-    5.1: "beacon_state heard registration redraw range_means",
+    5.1: "compiled beacon_state heard registration redraw range_means",
     5.2: "graph",
     5.25: "steps",
     5.3: "smoothing",

@@ -19,7 +19,7 @@ from uwbslam_jax.config import Config, Params
 from uwbslam_jax.keyframes import turned
 from uwbslam_jax.measurements import Scan, Snapshot, StampedFrame
 from uwbslam_jax.range_means import RangeMeans
-from uwbslam_jax.registration import Registration, View, register, view
+from uwbslam_jax.registration import View, register, view
 from uwbslam_jax.slam import Estimate
 
 _MOVED = (0.25, 0.2)
@@ -92,16 +92,15 @@ class Graph:
     """What was collected so far.
 
     Attributes:
-      ranges: see there. keyframes: rows of KEYFRAME.
+      ranges: see there. keyframes: rows of KEYFRAME; edges: rows of EDGE.
       scans: of each keyframe what it saw, lengths in millimetres; None where there was nothing to see, or others saw
         the same.
     """
 
     ranges: RangeMeans
     keyframes: Column = field(default_factory=lambda: Column(dtype=KEYFRAME))
+    edges: Column = field(default_factory=lambda: Column(dtype=EDGE))
     scans: list[Scan | None] = field(default_factory=list)
-    _edges: Column = field(default_factory=lambda: Column(dtype=EDGE))
-    _tying: tuple[list[int], int, np.ndarray, Registration] | None = None
     _wheels: np.ndarray = field(default_factory=lambda: np.zeros(3))
     _broken: bool = False
     _anchors: list[int] = field(default_factory=list)
@@ -111,13 +110,7 @@ class Graph:
 
     def copy(self) -> Graph:
         """What there is now; what is added later does not change it."""
-        return Graph(self.ranges.copy(), self.keyframes.copy(), list(self.scans), self.edges.copy())
-
-    @property
-    def edges(self) -> Column:
-        """Rows of EDGE."""
-        self._settle_ties()
-        return self._edges
+        return Graph(self.ranges.copy(), self.keyframes.copy(), self.edges.copy(), list(self.scans))
 
     def poses(self) -> np.ndarray:
         """(N, 3) where the map has the keyframes [m, m, rad]."""
@@ -232,21 +225,13 @@ class Graph:
         old = self._candidates(new)
         if not old:
             return
-        self._settle_ties()
         padded = (old * _TIES)[:_TIES]  # always as many: nothing is compiled again
         guess = relative(self.keyframes["pose"][padded], self.keyframes["pose"][new])
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *(self._view(params, k) for k in padded))
-        # computed while the host goes on; asked for when edges are
-        self._tying = old, new, guess, register(stacked, self._view(params, new), np.float32(guess))
-
-    def _settle_ties(self) -> None:
-        if self._tying is None:
-            return
-        (old, new, guess, tied), self._tying = self._tying, None
-        found = jax.device_get(tied)
+        found = jax.device_get(register(stacked, self._view(params, new), np.float32(guess)))
         believed = np.all(np.abs(found.pose - guess) < _BELIEVED, axis=1) & (found.share > _SHARE)
         for k in np.flatnonzero(believed[: len(old)]):
-            self._edges.append((old[k], new, found.pose[k], found.information[k]))
+            self.edges.append((old[k], new, found.pose[k], found.information[k]))
 
     def _view(self, params: Params, number: int) -> View:
         """The scan of a keyframe, made ready."""

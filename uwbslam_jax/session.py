@@ -8,24 +8,22 @@ joined, drops those that fell silent, and moves the map's window. The steps in b
 from __future__ import annotations
 
 import dataclasses
-from collections import Counter
 from collections.abc import Callable, Sequence
-from functools import cache, partial
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
 from uwbslam_jax import layout, slam, startup
 from uwbslam_jax.beacons import BeaconKeeper
-from uwbslam_jax.config import Config, Params, Settings, UwbSettings, make_config, make_params
+from uwbslam_jax.compiled import step_many, step_once
+from uwbslam_jax.config import Params, Settings, make_config, make_params
 from uwbslam_jax.graph import Graph
 from uwbslam_jax.hindsight import Hindsight, Question, look_back
 from uwbslam_jax.history import History
 from uwbslam_jax.keyframes import Buffer
-from uwbslam_jax.measurements import Frame, StampedFrame, empty_frame
-from uwbslam_jax.packing import Packing
+from uwbslam_jax.measurements import StampedFrame
 from uwbslam_jax.range_means import Node, RangeMeans
 from uwbslam_jax.redraw import redraw
 from uwbslam_jax.revision import Reviser, Revision, is_news, take_over
@@ -40,57 +38,6 @@ _NOTABLE_BIAS = 0.3
 """A bias larger than this share of sigma_n is told; smaller ones only take up what little was learnt of them."""
 _SOLVE_EVERY_S = 1.0
 """The start-up problem is solved at most this often, in the log's time."""
-
-TRACES: Counter[str] = Counter()
-"""How often each compiled function was traced, by name; a test counts them."""
-
-
-def step_once(config: Config, params: Params, state: State, frame: Frame) -> tuple[State, Estimate]:
-    """One compiled step; the state's buffers are reused. The estimate is on the host."""
-    frames, estimates = _packings(config)
-    state, told = _step_once(config, params, state, frames.pack(frame))
-    return state, estimates.unpack(np.asarray(told))
-
-
-def step_many(config: Config, params: Params, state: State, frames: Sequence[Frame]) -> tuple[State, list[Estimate]]:
-    """Steps over frames in order, as one compiled scan."""
-    packing, estimates = _packings(config)
-    state, told = _step_many(config, params, state, np.stack([packing.pack(frame) for frame in frames]))
-    return state, [estimates.unpack(row) for row in np.asarray(told)]
-
-
-@cache
-def _packings(config: Config) -> tuple[Packing[Frame], Packing[Estimate]]:
-    """How the frames and the estimates of a configuration lie in vectors."""
-    frame, state = empty_frame(config.max_beams, config.max_ranges), jax.eval_shape(partial(slam.init, config))
-    params = jax.eval_shape(lambda: make_params(Settings(uwb=UwbSettings(max_beacons=config.nodes - 1))))
-    _, estimate = jax.eval_shape(partial(slam.step, config), params, state, frame)
-    return Packing(frame), Packing(_reported(estimate))
-
-
-def _reported(estimate: Estimate) -> Estimate:
-    """What the host is told: what only gradients ask for is left out, and so it is not computed."""
-    return estimate._replace(match_log_likelihood=None)
-
-
-@partial(jax.jit, static_argnums=0, donate_argnums=2)
-def _step_once(config, params, state, frame):
-    TRACES["step_once"] += 1
-    return _guarded(config, params, state, frame)
-
-
-@partial(jax.jit, static_argnums=0, donate_argnums=2)
-def _step_many(config, params, state, frames):
-    TRACES["step_many"] += 1
-    return lax.scan(lambda s, f: _guarded(config, params, s, f), state, frames)
-
-
-def _guarded(config, params, state, frame):
-    # without the barriers the compiler fuses the step with the loop around it and rounds differently there
-    state, frame = lax.optimization_barrier((state, frame))
-    frames, estimates = _packings(config)
-    state, estimate = lax.optimization_barrier(slam.step(config, params, state, frames.unpack(frame)))
-    return state, estimates.pack_device(_reported(estimate))
 
 
 class Session:
@@ -171,7 +118,7 @@ class Session:
         if len(frames) != CONTROL_EVERY or self._pending:
             return [self.step(frame) for frame in frames]
         self._learn_slots(frames[-1])
-        self.state, estimates = step_many(self.config, self.params, self.state, [f.frame for f in frames])
+        self.state, estimates = step_many(self.config, self.params, self.state, frames)
         for frame, estimate in zip(frames, estimates, strict=True):
             self._take(frame, estimate)
         return estimates
