@@ -75,7 +75,8 @@ def prepare() -> None:
     """Settings of the process that the libraries read once, before they are imported.
 
     Compiled programs are kept in the user's cache folder: the second run starts in seconds. LAPACK and XLA work alone:
-    LAPACK's threads spin over matrices of 40 rows and make a step many times slower than one thread does.
+    LAPACK's threads spin over matrices of 40 rows and make a step many times slower than one thread does. Memory is
+    allocated from a few heaps, see `memory`.
     """
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "uwbslam_jax" / "jax"
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache))

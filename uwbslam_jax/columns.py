@@ -6,8 +6,6 @@ the heap in pieces.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
 _LEAST = 64
@@ -56,9 +54,6 @@ class Column:
 
     def __getitem__(self, index):
         return self.values[index]
-
-    def __iter__(self) -> Iterator:
-        return iter(self.values)
 
     def __array__(self, dtype=None, copy=None) -> np.ndarray:
         return np.array(self.values, dtype)

@@ -142,16 +142,11 @@ class Problem:
                 d = (middle - bias[a[0]] - bias[b[0]]) / (1 + bias_scale)
                 s = mean_sigma(0.64 * len(values), scatter, graph.ranges.sigma_n)
                 pairs.append((index[a], index[b], d, height[a[0]] - height[b[0]], s))
-        way = steps(graph, poses)
         return Problem(
             len(graph.keyframes),
             nodes,
             slots,
-            way.old,
-            way.new,
-            way.between,
-            way.roots,
-            way.soft,
+            *steps(graph, poses),
             even_drive(graph),
             means["at"],
             to,
