@@ -6,7 +6,7 @@ from collections import deque
 
 import numpy as np
 
-from uwbslam_jax import smoothing
+from uwbslam_jax import smoothing, sparse_rows
 from uwbslam_jax.graph import Graph, relative
 from uwbslam_jax.range_means import RangeMeans
 
@@ -185,11 +185,50 @@ def test_derivatives_agree_with_differences() -> None:
     x = problem.start(graph.poses() + rng.normal(0, 0.05, truth.shape), places)
     x[-5:] += rng.normal(0, 0.05, 5)
     stage, sigmas = (1e6, 1.0), 0.3  # edges not softened: their reweighting is no derivative of the residual
-    J, _ = problem._linearise(x, x[:3], sigmas, stage)
+    fill = problem._rows(x[:3].copy(), sigmas, stage)
+    J, _ = stacked(fill, x)
     h = 1e-6
     for column in rng.choice(len(x), 40, replace=False):
         e = h * np.eye(len(x))[column]
-        ahead = problem._linearise(x + e, x[:3], sigmas, stage)[1]
-        behind = problem._linearise(x - e, x[:3], sigmas, stage)[1]
-        want = (ahead - behind) / (2 * h)
-        np.testing.assert_allclose(J[:, [column]].toarray()[:, 0], want, rtol=1e-4, atol=1e-4 * max(1, abs(want).max()))
+        want = (stacked(fill, x + e)[1] - stacked(fill, x - e)[1]) / (2 * h)
+        np.testing.assert_allclose(J[:, column], want, rtol=1e-4, atol=1e-4 * max(1, abs(want).max()))
+
+
+class Stack:
+    """A sink that keeps the rows: a dense Jacobian and the residuals."""
+
+    def __init__(self, unknowns: int):
+        self.unknowns, self.rows = unknowns, []
+
+    def add(self, residual, parts) -> None:
+        J = np.zeros((len(residual), self.unknowns))
+        for column, value in parts:
+            J[np.arange(len(residual)), column] += value
+        self.rows.append((J, residual))
+
+
+def stacked(fill, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    sink = Stack(len(x))
+    fill(x, sink)
+    J, r = (np.concatenate(part) for part in zip(*sink.rows, strict=True))
+    return J, r
+
+
+def test_normal_equations_are_those_of_the_rows(monkeypatch) -> None:
+    """Gathered block by block, with a few rows in each, they are J.T J, J.T r and r.r / 2 of all rows."""
+    monkeypatch.setattr(sparse_rows, "_BLOCK", 7)
+    truth = loop(40)
+    graph = make(truth)
+    places = {(slot, 0): spot for slot, spot in BEACONS.items()}
+    problem = smoothing.Problem.build(graph, graph.poses(), places, np.zeros(K), np.zeros(K), 0.0)
+    x = problem.start(graph.poses() + np.random.default_rng(5).normal(0, 0.05, truth.shape), places)
+    fill = problem._rows(x[:3] + 1e-5, 0.3, (30.0, 2.0))
+    J, r = stacked(fill, x)
+    rank = np.random.default_rng(6).permutation(len(x))
+    rows, cost = sparse_rows.Rows(rank), sparse_rows.Cost()
+    fill(x, rows)
+    fill(x, cost)
+    A, b = rows.normal()
+    np.testing.assert_allclose(A.toarray()[np.ix_(rank, rank)], J.T @ J, rtol=1e-9, atol=1e-6)
+    np.testing.assert_allclose(b[rank], J.T @ r, rtol=1e-9, atol=1e-6)
+    np.testing.assert_allclose(cost.cost, 0.5 * r @ r)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from uwbslam_jax import __version__
+from uwbslam_jax.history import History
 from uwbslam_jax.relative import Relative
 from uwbslam_jax.result import BeaconEstimate, Result
 from uwbslam_jax.session import Session
@@ -53,18 +54,15 @@ def to_result(session: Session, facts: Facts) -> Result:
     """
     history = session.history
     scans = bool(history.has_scan.values.any())
-    at = np.flatnonzero(history.has_scan) if scans or not facts.odometry_used else np.arange(len(history.stamps))
+    told_of = np.asarray(history.has_scan) if scans or not facts.odometry_used else np.ones(len(history.stamps), bool)
+    at = slice(None) if told_of.all() else np.flatnonzero(told_of)  # nothing is copied where it is all of them
     told = [] if scans else [_NO_SCAN if facts.odometry_used else _NO_TRACK]
     told += [] if facts.relative is None else [_RELATIVE]
     told += _biases(session)
     facts = dataclasses.replace(facts, warnings=[*facts.warnings, *told])
-    stamps = np.array(history.stamps, np.int64)[at]
+    stamps = history.stamps.values[at]
     start = int(stamps[0]) if len(stamps) else 0
     ids = {slot: node for node, slot in session.slots.items()}
-    residuals = [((t - start) / 1e9, ids[i], ids[j], r) for t, i, j, r in history.residuals.values.tolist()]
-    tracks: dict[int, list[tuple[float, float, float, float]]] = {}
-    for t, slot, x, y, sigma in history.tracks.values.tolist():
-        tracks.setdefault(ids[slot], []).append(((t - start) / 1e9, x, y, sigma))
     online = np.array(history.poses, float).reshape(-1, 3)
     track = online if session.hindsight is None else session.hindsight.track
     diagnostics = {name: values[at] for name, values in history.diagnostics.items()}
@@ -74,16 +72,34 @@ def to_result(session: Session, facts: Facts) -> Result:
         stamps=stamps,
         poses=track[at],
         online=online[at],
-        online_covs=np.array(history.covs, float).reshape(-1, 3, 3)[at],
+        online_covs=history.covs.values[at],
         beacons=_beacons(session, ids) if facts.relative is None else _relative_beacons(session, facts.relative),
-        beacon_tracks={node: np.array(rows, float) for node, rows in tracks.items()},
+        beacon_tracks=_tracks(history, ids, start),
         map=session.tiles.image(session.state.grid),
-        range_residuals=np.array(residuals, float).reshape(-1, 4),
+        range_residuals=_residuals(history, ids, start),
         scan_points=_scan_points(session),
         diagnostics=diagnostics,
         events=list(history.events),
         summary=_summary(session, facts),
     )
+
+
+def _residuals(history: History, ids: dict[int, int], start: int) -> np.ndarray:
+    """(R, 4) t [s], nodes, residual [m]."""
+    rows = history.residuals.values
+    nodes = (np.array([ids[slot] for slot in rows[side].tolist()], float) for side in ("i", "j"))
+    return np.column_stack([(rows["stamp"] - start) / 1e9, *nodes, rows["residual"]])
+
+
+def _tracks(history: History, ids: dict[int, int], start: int) -> dict[int, np.ndarray]:
+    """Node -> (n, 4) t [s], x, y, sigma [m], the nodes in the order in which they were placed."""
+    rows = history.tracks.values
+    slots, first = np.unique(rows["slot"], return_index=True)
+    tracks = {}
+    for slot in slots[np.argsort(first)].tolist():
+        own = rows[rows["slot"] == slot]
+        tracks[ids[slot]] = np.column_stack([(own["stamp"] - start) / 1e9, own["x"], own["y"], own["s"]])
+    return tracks
 
 
 def _biases(session: Session) -> list[str]:

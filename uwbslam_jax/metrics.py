@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from uwbslam_jax.columns import Column
 from uwbslam_jax.measurements import TruthMessage
 from uwbslam_jax.result import Result
 
@@ -22,6 +23,17 @@ NAN = float("nan")
 # The joint fit of robot and beacons: about this many poses, evenly, each beacon counting as much as this many poses.
 FIT_POSES = 400
 BEACON_WEIGHT = 20.0
+
+
+TRUTH = np.dtype([("stamp", np.int64), ("node", np.int64), ("pose", np.float64, 3)])
+"""A message of the ground truth: stamp [ns], node's id or ROBOT, pose [m, m, rad]; a run of hours has very many."""
+ROBOT = -1
+
+
+def truth_row(message: TruthMessage) -> tuple[int, int, tuple[float, float, float]]:
+    """A row of TRUTH."""
+    node = ROBOT if message.node is None else message.node
+    return message.stamp, node, (message.x, message.y, message.yaw)
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,19 +57,27 @@ class Truth:
         Raises:
           ValueError: no message about the robot.
         """
-        robot: list[TruthMessage] = []
-        beacons: dict[int, list[tuple[float, float, float]]] = {}
-        for message in sorted(messages, key=lambda message: message.stamp):
-            if message.node is None:
-                robot.append(message)
-            else:
-                beacons.setdefault(message.node, []).append((message.stamp, message.x, message.y))
-        if not robot:
+        rows = Column(dtype=TRUTH)
+        for message in messages:
+            rows.append(truth_row(message))
+        return cls.from_rows(rows.values)
+
+    @classmethod
+    def from_rows(cls, rows: np.ndarray) -> Truth:
+        """Truth from rows of TRUTH, in any order.
+
+        Raises:
+          ValueError: no row about the robot.
+        """
+        rows = rows[np.argsort(rows["stamp"], kind="stable")]
+        robot, others = rows[rows["node"] == ROBOT], rows[rows["node"] != ROBOT]
+        if not len(robot):
             raise ValueError("the ground truth holds no pose of the robot")
+        beacons = {node: others[others["node"] == node] for node in np.unique(others["node"]).tolist()}
         return cls(
-            stamps=np.array([message.stamp for message in robot], np.int64),
-            robot=np.array([(message.x, message.y, message.yaw) for message in robot], float),
-            beacons={node: np.array(rows, float) for node, rows in sorted(beacons.items())},
+            stamps=robot["stamp"].copy(),
+            robot=robot["pose"].copy(),
+            beacons={node: np.column_stack([own["stamp"], own["pose"][:, :2]]) for node, own in beacons.items()},
         )
 
     @classmethod

@@ -6,14 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import sparse
 
 from uwbslam_jax.config import Params
 from uwbslam_jax.graph import Graph, relative, wrapped
 from uwbslam_jax.keyframes import turned
 from uwbslam_jax.multilateration import soften
 from uwbslam_jax.smoothing import Problem, Solution
-from uwbslam_jax.sparse_rows import Rows, factor
+from uwbslam_jax.sparse_rows import Sink, covariance, minimise
 from uwbslam_jax.startup import compose
 
 _SCALE = 0.1
@@ -91,49 +90,31 @@ class Mounting:
         # a bias that is not asked for is what the run took it for
         spread[at], mean[at] = prior, offset
         x = self.start.copy()
+        fill = self._rows(spread, mean)
+        rank = np.append(self.problem.rank, np.arange(self.problem.size, len(x)))
         for self.stage in _STAGES:
-            x, J = self._descend(x, spread, mean)
+            x, _ = minimise(fill, x, rank, moves=_MOVES, enough=_ENOUGH)
             self.wheels = self._wheel_errors(x)
         columns = np.arange(self.bias, len(x))
-        unit = np.zeros((len(x), len(columns)))
-        unit[columns, np.arange(len(columns))] = 1.0
-        cov = factor((J.T @ J + 1e-9 * sparse.eye(len(x))).tocsc()).solve(unit)[columns]
         sigma = np.zeros(len(x))
-        sigma[columns] = np.sqrt(np.maximum(np.diag(cov), 0.0))
+        sigma[columns] = np.sqrt(np.maximum(np.diag(covariance(fill, x, rank, columns)), 0.0))
         return x, sigma
 
-    def _descend(self, x: Array, spread: Array, mean: Array) -> tuple[Array, sparse.csr_matrix]:
-        """Levenberg-Marquardt."""
-        J, r = self._linearise(x, spread, mean)
-        cost, damping = 0.5 * r @ r, 1e-6
-        for _ in range(_MOVES):
-            A = (J.T @ J).tocsc()
-            step = factor(A + damping * sparse.diags(A.diagonal() + 1e-9, format="csc")).solve(J.T @ r)
-            new_J, new_r = self._linearise(x - step, spread, mean)
-            new_cost = 0.5 * new_r @ new_r
-            if new_cost < cost:
-                gain, x, J, r, cost = cost - new_cost, x - step, new_J, new_r, new_cost
-                damping = max(damping / 10, 1e-12)
-                if gain < _ENOUGH:
-                    break
-            elif damping > 1e6:
-                break
-            else:
-                damping *= 10
-        return x, J
+    def _rows(self, spread: Array, mean: Array) -> Callable[[Array, Sink], None]:
+        """What puts all rows at some unknowns into a sink."""
 
-    def _linearise(self, x: Array, spread: Array, mean: Array) -> tuple[sparse.csr_matrix, Array]:
-        rows = Rows(len(x))
-        rows.add((x[:3] - self.start[:3]) / _HELD, [(np.arange(3), np.full(3, 1 / _HELD))])
-        tail = np.arange(self.bias, len(x))
-        rows.add((x[tail] - mean[tail]) / spread[tail], [(tail, 1 / spread[tail])])
-        self._scans(rows, x)
-        self._wheels(rows, x)
-        self._ranges(rows, x)
-        self.problem.add_pairs(rows, x, self.stage[1])
-        return rows.matrix(), rows.residuals()
+        def fill(x: Array, rows: Sink) -> None:
+            rows.add((x[:3] - self.start[:3]) / _HELD, [(np.arange(3), np.full(3, 1 / _HELD))])
+            tail = np.arange(self.bias, len(x))
+            rows.add((x[tail] - mean[tail]) / spread[tail], [(tail, 1 / spread[tail])])
+            self._scans(rows, x)
+            self._wheels(rows, x)
+            self._ranges(rows, x)
+            self.problem.add_pairs(rows, x, self.stage[1])
 
-    def _scans(self, rows: Rows, x: Array) -> None:
+        return fill
+
+    def _scans(self, rows: Sink, x: Array) -> None:
         """The LiDAR's own motions. Compared in its own frame, where they are the same whatever the mounting is: in the
         robot's a turn of the frame would turn the residuals, and pass for something that they tell."""
         p = self.problem
@@ -168,7 +149,7 @@ class Mounting:
         new = new[new > 0]
         return new, self.graph.keyframes["wheels"][new]
 
-    def _wheels(self, rows: Rows, x: Array) -> None:
+    def _wheels(self, rows: Sink, x: Array) -> None:
         new, wheels = self._steps()
         if not len(new):
             return
@@ -196,7 +177,7 @@ class Mounting:
         factors = np.median(off[:, :2]) / 0.674, np.median(off[:, 2]) / 0.674
         return self.wheels[0] * factors[0], self.wheels[1] * factors[1]
 
-    def _ranges(self, rows: Rows, x: Array) -> None:
+    def _ranges(self, rows: Sink, x: Array) -> None:
         p, n = self.problem, 3 * self.problem.count
         robot = np.full(len(p.at), self.bias)
         lidar = _shared(self.lidar, 3, len(p.at))
@@ -246,7 +227,7 @@ def _shared(first: int, count: int, rows: int) -> list[Array]:
     return [np.full(rows, first + k) for k in range(count)]
 
 
-def _add(rows: Rows, x: Array, columns: list[Array], residual: Callable[[Array], Array]) -> None:
+def _add(rows: Sink, x: Array, columns: list[Array], residual: Callable[[Array], Array]) -> None:
     """Residuals (n, d) of a few unknowns each, with central differences as their derivatives."""
     v = np.stack([x[column] for column in columns], axis=1)
     r = residual(v)

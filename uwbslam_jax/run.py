@@ -13,15 +13,17 @@ from collections.abc import Callable, Iterable
 from types import TracebackType
 
 import jax
+import numpy as np
 
 from uwbslam_jax import relative
 from uwbslam_jax.bag import Source
+from uwbslam_jax.columns import Column
 from uwbslam_jax.config import Settings
 from uwbslam_jax.findings import Facts, to_result
 from uwbslam_jax.frames import FrameAssembler
 from uwbslam_jax.mcap_log import LogError, LogReader
 from uwbslam_jax.measurements import Message, ScanMessage, StampedFrame, TruthMessage
-from uwbslam_jax.metrics import Truth
+from uwbslam_jax.metrics import ROBOT, TRUTH, Truth, truth_row
 from uwbslam_jax.relative import Links, Relative
 from uwbslam_jax.result import Result
 from uwbslam_jax.session import CONTROL_EVERY, Session
@@ -62,12 +64,12 @@ class Runner:
 
     Attributes:
       session: the estimator's.
-      truths: the ground truth messages so far.
+      truths: rows of the ground truth so far.
     """
 
     def __init__(self, settings: Settings, clock: CompileClock, *, online: bool = False):
         self.session = Session(settings)
-        self.truths: list[TruthMessage] = []
+        self.truths = Column(dtype=TRUTH)
         self._assembler = FrameAssembler(settings, self.session.config.max_ranges)
         self._group = 1 if online else CONTROL_EVERY
         self._clock = clock
@@ -82,7 +84,7 @@ class Runner:
     def add(self, message: Message) -> list[Estimate]:
         """The estimates that a message leads to; in batch mode they come in groups."""
         if isinstance(message, TruthMessage):
-            self.truths.append(message)
+            self.truths.append(truth_row(message))
             return []
         return [e for frame in self._assembler.add(message) for e in self._take(frame)]
 
@@ -121,8 +123,8 @@ class Runner:
 
     def truth(self) -> Truth | None:
         """The ground truth so far, None where there is none of the robot."""
-        known = any(message.node is None for message in self.truths)
-        return Truth.from_messages(self.truths) if known else None
+        known = bool(np.any(self.truths["node"] == ROBOT))
+        return Truth.from_rows(self.truths.values) if known else None
 
     def _take(self, frame: StampedFrame) -> list[Estimate]:
         self._waiting.append(frame)

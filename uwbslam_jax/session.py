@@ -152,7 +152,7 @@ class Session:
         self._take_over(Revision(solution, grid, self.tiles))
 
     def _question(self) -> Question | None:
-        """What to solve of the run so far."""
+        """What to solve of the run so far. Its graph is the one that grows."""
         if self.decided_at is None or not self._looks_back:
             return None
         positions = np.asarray(layout.unpack(self.state.belief.mean).positions, float)
@@ -162,7 +162,7 @@ class Session:
         }
         poses = self.history.poses[self.graph.keyframes["frame"]].astype(float)
         configured = make_params(self.settings, self._slots)
-        return Question(self.graph.copy(), poses, places, configured, self._frame_nodes, bool(self.found_bias))
+        return Question(self.graph, poses, places, configured, self._frame_nodes, bool(self.found_bias))
 
     def _learn_slots(self, frame: StampedFrame) -> None:
         if len(frame.slots) > len(self._slots):
@@ -276,6 +276,7 @@ class Session:
         if self._looks_back and self._reviser.wants(len(self.graph.keyframes)):
             question = self._question()
             if question is not None:
+                question = question._replace(graph=self.graph.copy())
                 epoch = float(self.state.map_spread.way)
                 self._reviser.begin(self.config, self.params, question, self.settings.map.resolution, epoch)
 

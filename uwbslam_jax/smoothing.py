@@ -6,17 +6,18 @@ the rest of the run tells about it (in the words of the field: the back end; for
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy import sparse
 
 from uwbslam_jax.graph import Graph, relative, wrapped
 from uwbslam_jax.keyframes import mean_sigma, turned
 from uwbslam_jax.multilateration import DECIDED, soften
 from uwbslam_jax.range_means import Node
-from uwbslam_jax.sparse_rows import Rows, factor
+from uwbslam_jax.sparse_rows import Sink, blocks, covariance, elimination, minimise
 from uwbslam_jax.steps import even_drive, steps
 
 CALIBRATED_M = 1e-3
@@ -165,6 +166,16 @@ class Problem:
         """Unknowns: poses, places, a bias of each slot."""
         return self._first_bias + len(self.slots)
 
+    @cached_property
+    def rank(self) -> np.ndarray:
+        """(size,) in which order the unknowns are eliminated: poses by what ties them to each other, then places and
+        biases, on which every pose hangs."""
+        middle = self.steady[:, 0].astype(int)
+        i = np.concatenate([self.old, self.at, middle - 1, middle - 1, middle])
+        j = np.concatenate([self.new, self.at + 1, middle, middle + 1, middle + 1])
+        poses = 3 * elimination(i, j, self.count)[:, None] + np.arange(3)
+        return np.append(poses.ravel(), np.arange(3 * self.count, self.size))
+
     @property
     def _first_bias(self) -> int:
         return 3 * self.count + 2 * len(self.nodes)
@@ -180,39 +191,14 @@ class Problem:
 
     def minimise(self, x: np.ndarray, bias_sigma: float) -> tuple[np.ndarray, float]:
         """Levenberg-Marquardt from x: unknowns and cost."""
+        held, cost = x[:3].copy(), np.inf
         for stage in _STAGES:
-            x, cost = self._descend(x, bias_sigma, stage)
+            x, cost = minimise(self._rows(held, bias_sigma, stage), x, self.rank, moves=_MOVES, enough=_ENOUGH)
         return x, cost
-
-    def _descend(self, x: np.ndarray, bias_sigma: float, stage: tuple[float, float]) -> tuple[np.ndarray, float]:
-        held = x[:3].copy()
-        J, r = self._linearise(x, held, bias_sigma, stage)
-        cost, damping = 0.5 * r @ r, 1e-6
-        for _ in range(_MOVES):
-            A = (J.T @ J).tocsc()
-            step = factor(A + damping * sparse.diags(A.diagonal() + 1e-9, format="csc")).solve(J.T @ r)
-            moved = x - step
-            new_J, new_r = self._linearise(moved, held, bias_sigma, stage)
-            new_cost = 0.5 * new_r @ new_r
-            if new_cost < cost:
-                gain, x, J, r, cost = cost - new_cost, moved, new_J, new_r, new_cost
-                damping = max(damping / 10, 1e-12)
-                if gain < _ENOUGH:
-                    break
-            else:
-                damping *= 10
-                if damping > 1e8:
-                    break
-        return x, float(cost)
 
     def solution(self, x: np.ndarray, cost: float, bias_sigma: float, biased: bool) -> Solution:
         n, m = 3 * self.count, self._first_bias
-        J, _ = self._linearise(x, x[:3], bias_sigma, _STAGES[-1])
-        columns = np.arange(n - 3, self.size)
-        unit = np.zeros((self.size, len(columns)))
-        unit[columns, np.arange(len(columns))] = 1.0
-        A = (J.T @ J).tocsc()
-        cov = factor(A + 1e-9 * sparse.eye(self.size, format="csc")).solve(unit)[columns]
+        cov = covariance(self._rows(x[:3], bias_sigma, _STAGES[-1]), x, self.rank, np.arange(n - 3, self.size))
         spread = np.sqrt(np.maximum(np.diag(cov)[m - n + 3 :], 0.0))
         return Solution(
             x[:n].reshape(-1, 3),
@@ -225,22 +211,27 @@ class Problem:
             cov[: m - n + 3, : m - n + 3],
         )
 
-    def _linearise(self, x, held, bias_sigma, stage) -> tuple[sparse.csr_matrix, np.ndarray]:
-        """Whitened Jacobian and residuals of held start, edges, steady velocity, ranges, pairs and biases."""
-        rows = Rows(self.size)
-        poses = x[: 3 * self.count].reshape(-1, 3)
-        rows.add((x[:3] - held)[:, None] / _HELD, [(np.arange(3), np.full(3, 1 / _HELD))])
-        self._edge_rows(rows, poses, stage[0])
-        self._steady_rows(rows, poses)
-        self._range_rows(rows, x, poses, stage[1])
-        self.add_pairs(rows, x, stage[1])
-        m = self._first_bias
-        rows.add(x[m:] / bias_sigma, [(np.arange(m, self.size), np.full(len(self.slots), 1 / bias_sigma))])
-        return rows.matrix(), rows.residuals()
+    def _rows(self, held: np.ndarray, bias_sigma: float, stage: tuple[float, float]) -> Callable:
+        """What puts whitened rows of held start, edges, steady velocity, ranges, pairs and biases into a sink."""
 
-    def _edge_rows(self, rows: Rows, poses, soft: float) -> None:
-        a, b = poses[self.old], poses[self.new]
-        e = relative(a, b) - self.between
+        def fill(x: np.ndarray, rows: Sink) -> None:
+            poses = x[: 3 * self.count].reshape(-1, 3)
+            rows.add((x[:3] - held) / _HELD, [(np.arange(3), np.full(3, 1 / _HELD))])
+            for part in blocks(len(self.old)):
+                self._edge_rows(rows, poses, stage[0], part)
+            self._steady_rows(rows, poses)
+            for part in blocks(len(self.at)):
+                self._range_rows(rows, x, poses, stage[1], part)
+            self.add_pairs(rows, x, stage[1])
+            m = self._first_bias
+            rows.add(x[m:] / bias_sigma, [(np.arange(m, self.size), np.full(len(self.slots), 1 / bias_sigma))])
+
+        return fill
+
+    def _edge_rows(self, rows: Sink, poses, soft: float, part: slice) -> None:
+        old, new, roots = self.old[part], self.new[part], self.roots[part]
+        a, b = poses[old], poses[new]
+        e = relative(a, b) - self.between[part]
         e[:, 2] = wrapped(e[:, 2])
         c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
         zero, one = np.zeros_like(c), np.ones_like(c)
@@ -254,16 +245,16 @@ class Problem:
             np.stack([s, c, zero], -1),
             np.stack([zero, zero, one], -1),
         ]
-        white = np.einsum("eij,ej->ei", self.roots, e)
+        white = np.einsum("eij,ej->ei", roots, e)
         # Geman-McClure of the whole edge, as `soften` for a range
-        inside = np.where(self.soft, 1.0 + np.sum(white**2, axis=1) / soft**2, 1.0)
-        scaled = self.roots * inside[:, None, None] ** -1.5
-        columns = [3 * self.old, 3 * self.old + 1, 3 * self.old + 2, 3 * self.new, 3 * self.new + 1, 3 * self.new + 2]
+        inside = np.where(self.soft[part], 1.0 + np.sum(white**2, axis=1) / soft**2, 1.0)
+        scaled = roots * inside[:, None, None] ** -1.5
+        columns = [3 * old, 3 * old + 1, 3 * old + 2, 3 * new, 3 * new + 1, 3 * new + 2]
         parts = [(column, np.einsum("eij,ej->ei", scaled, d)) for column, d in zip(columns, by, strict=True)]
         for k in range(3):
             rows.add(white[:, k] / np.sqrt(inside), [(column, d[:, k]) for column, d in parts])
 
-    def _steady_rows(self, rows: Rows, poses) -> None:
+    def _steady_rows(self, rows: Sink, poses) -> None:
         if not len(self.steady):
             return
         k, before, after, turn, sigma = self.steady.T
@@ -281,30 +272,31 @@ class Problem:
                 parts += [(3 * k + other, -pull), (3 * (k - 1) + other, pull)]
             rows.add(r, parts)
 
-    def _range_rows(self, rows: Rows, x, poses, coarse: float) -> None:
+    def _range_rows(self, rows: Sink, x, poses, coarse: float, part: slice) -> None:
         n = 3 * self.count
         beacons = x[n : n + 2 * len(self.nodes)].reshape(-1, 2)
-        levers = ((self.at, self.before), (self.at + 1, self.after))
+        at, to, share = self.at[part], self.to[part], self.share[part]
+        levers = ((at, self.before[part]), (at + 1, self.after[part]))
         ends = [poses[k, :2] + turned(poses[k, 2], lever) for k, lever in levers]
-        antenna = (1 - self.share)[:, None] * ends[0] + self.share[:, None] * ends[1]
-        u = antenna - beacons[self.to]
-        d = np.maximum(np.sqrt((u**2).sum(1) + self.rise**2), 1e-6)
-        column = self.bias_column(self.to)
+        antenna = (1 - share)[:, None] * ends[0] + share[:, None] * ends[1]
+        u = antenna - beacons[to]
+        d = np.maximum(np.sqrt((u**2).sum(1) + self.rise[part] ** 2), 1e-6)
+        column = self.bias_column(to)
         robot = self._first_bias
-        sigma = coarse * self.sigma
-        r, scale = soften((d + x[robot] + x[column] - self.distance) / sigma)
+        sigma = coarse * self.sigma[part]
+        r, scale = soften((d + x[robot] + x[column] - self.distance[part]) / sigma)
         weight = scale / sigma
         unit = u / d[:, None]
         parts = []
-        for key, end, part in ((self.at, ends[0], 1 - self.share), (self.at + 1, ends[1], self.share)):
+        for key, end, near in ((at, ends[0], 1 - share), (at + 1, ends[1], share)):
             lever = end - poses[key, :2]
-            parts += [(3 * key + axis, part * weight * unit[:, axis]) for axis in range(2)]
-            parts.append((3 * key + 2, part * weight * (unit[:, 1] * lever[:, 0] - unit[:, 0] * lever[:, 1])))
-        parts += [(n + 2 * self.to + axis, -weight * unit[:, axis]) for axis in range(2)]
+            parts += [(3 * key + axis, near * weight * unit[:, axis]) for axis in range(2)]
+            parts.append((3 * key + 2, near * weight * (unit[:, 1] * lever[:, 0] - unit[:, 0] * lever[:, 1])))
+        parts += [(n + 2 * to + axis, -weight * unit[:, axis]) for axis in range(2)]
         parts += [(np.full(len(d), robot), weight), (column, weight)]
         rows.add(r, parts)
 
-    def add_pairs(self, rows: Rows, x: np.ndarray, coarse: float = 1.0) -> None:
+    def add_pairs(self, rows: Sink, x: np.ndarray, coarse: float = 1.0) -> None:
         """Rows of the ranges between beacons; coarse: how many times as much they may err."""
         if not len(self.pair):
             return
