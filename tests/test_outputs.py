@@ -250,6 +250,18 @@ class TestResultLog:
         assert transforms[0].transform.rotation.w == 1.0
         assert transforms[-1].transform.translation.x == pytest.approx(make_result().poses[-1, 0])
 
+    def test_a_path_of_many_poses_is_thinned(self, tmp_path: Path) -> None:
+        """At 40 Hz every fourth pose, and the last one; the transforms have them all."""
+        result = make_result()
+        result.stamps = result.stamps[0] + 25_000_000 * np.arange(FRAMES)
+        write_result(result, tmp_path)
+        reader = pytest.importorskip("mcap_ros2.reader")
+        (path,) = (m.ros_msg for m in reader.read_ros2_messages(str(tmp_path / "result.mcap"), topics=["/path"]))
+        stamps = np.array([p.header.stamp.sec * 10**9 + p.header.stamp.nanosec for p in path.poses])
+        assert stamps[-1] == result.stamps[np.isfinite(result.poses).all(axis=1)][-1]
+        assert (np.diff(stamps)[1:-1] == 100_000_000).all()
+        assert 0 < len(stamps) < FRAMES / 3
+
     def test_beacons(self, messages: list[tuple[str, int, Any]]) -> None:
         arrays = [m.markers for topic, _, m in messages if topic == "/beacons"]
         assert len(arrays[0]) == 3  # one beacon heard yet: post, text, ellipse

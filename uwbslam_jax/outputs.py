@@ -70,9 +70,10 @@ def write_trajectory(stamps: np.ndarray, poses: np.ndarray, path: Path) -> None:
     The time is written from the integer: a float64 holds an epoch only to 0.2 microseconds.
     """
     with path.open("w", encoding="ascii") as file:
-        for stamp, (x, y, yaw) in zip(stamps.tolist(), poses.tolist(), strict=True):
+        for stamp, pose in zip(stamps, poses, strict=True):  # no list of them all: there may be hours
+            x, y, yaw = pose.tolist()
             if math.isfinite(x + y + yaw):
-                sec, nanosec = divmod(stamp, 1_000_000_000)
+                sec, nanosec = divmod(int(stamp), 1_000_000_000)
                 turn = f"{math.sin(yaw / 2):.9f} {math.cos(yaw / 2):.9f}"
                 file.write(f"{sec}.{nanosec:09d} {x:.6f} {y:.6f} 0 0 0 {turn}\n")
 

@@ -20,6 +20,7 @@ from uwbslam_jax.result import BeaconEstimate, MapImage, Result
 from uwbslam_jax.ros_types import build, definition, header, pose, quaternion, serialize, time, vector
 
 DIAGNOSTICS_PERIOD = 100_000_000  # at most 10 Hz [ns]
+PATH_PERIOD = 100_000_000  # at most 10 Hz [ns]: one message, for looking at; /tf has every pose
 BEACONS_PERIOD = 1_000_000_000  # about 1 Hz [ns]
 MAP_FRAME, UWB_FRAME = "map", "uwb"
 _COLORS = {  # of a beacon, by status
@@ -86,7 +87,13 @@ def crop(image: MapImage) -> MapImage:
 def _once(result: Result, start: int, known: np.ndarray) -> Iterator[_Item]:
     yield _Item(start, "/tf", lambda: _packed(_transform(start, UWB_FRAME, 0.0, 0.0, 0.0)))
     yield _Item(start, "/map", lambda: occupancy(result.map, start))
-    yield _Item(start, "/path", lambda: _path(result, start, known))
+    yield _Item(start, "/path", lambda: _path(result, start, _thinned(result, known)))
+
+
+def _thinned(result: Result, known: np.ndarray) -> np.ndarray:
+    """The first of the known frames in each PATH_PERIOD, and the last one."""
+    _, first = np.unique(result.stamps[known] // PATH_PERIOD, return_index=True)
+    return np.union1d(known[first], known[-1:])
 
 
 def _packed(message: Any) -> tuple[str, bytes]:
@@ -151,7 +158,7 @@ def _transform(stamp: int, child: str, x: float, y: float, yaw: float) -> Any:
 
 
 def _path(result: Result, stamp: int, known: np.ndarray) -> tuple[str, bytes]:
-    """Path of every pose, packed."""
+    """Path of some poses, packed."""
     head = _CDR + struct.pack("<iII4sI", *divmod(stamp, 1_000_000_000), 4, b"map", len(known))
     rows = np.zeros(len(known), _STAMPED)
     rows["time"] = np.stack(np.divmod(result.stamps[known], 1_000_000_000), axis=-1)

@@ -14,7 +14,7 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from uwbslam_jax import memory
 
-_BLOCK = 16384
+_BLOCK = 2048
 """So many rows are put together at a time."""
 
 
