@@ -28,7 +28,10 @@ from uwbslam_jax.startup import anchored, compose
 from uwbslam_jax.tiles import Tiles
 
 _LOOKS = 5
-"""Looks of the host that the solution may take, and as many that the drawing may."""
+"""Looks of the host that the solution may take at least, and as many that the drawing may."""
+_KEYFRAMES_A_LOOK = 25
+"""For so many keyframes it may take one more: the host waits for what is due, and a robot drives on meanwhile. A
+solution takes some 0.7 ms a keyframe, a look comes every 250 ms at 40 Hz, and in batch every 15 ms."""
 _GROWTH = 1.25
 """A revision is begun when the graph has grown by so much since the last one."""
 _FEWEST = 24
@@ -94,7 +97,8 @@ class Reviser:
         """Begins one from what was collected so far. epoch: of the ground that is drawn, see grid [m]."""
         self._pool = self._pool or ThreadPoolExecutor(1, thread_name_prefix="revision")
         self._job = _Job(config, params, question, resolution, epoch)
-        self._begun_with, self._due = len(question.graph.keyframes), _LOOKS
+        self._begun_with = len(question.graph.keyframes)
+        self._due = _LOOKS + self._begun_with // _KEYFRAMES_A_LOOK
         self._running = self._pool.submit(self._job.solve)
 
     def look(self, news: Callable[[Solution], bool]) -> Revision | None:
@@ -113,7 +117,8 @@ class Reviser:
             return found if news(found.solution) else None
         self.solved += found is not None
         if found is not None and news(found):
-            self._job, self._running, self._due = job, self._pool.submit(job.draw, found), _LOOKS
+            self._job, self._running = job, self._pool.submit(job.draw, found)
+            self._due = _LOOKS + self._begun_with // _KEYFRAMES_A_LOOK
         return None
 
     def drop(self) -> None:
