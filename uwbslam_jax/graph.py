@@ -181,29 +181,28 @@ class Graph:
         self.keyframes["pose"][:] = poses
         self.keyframes["informed"][:] = R @ self.keyframes["informed"] @ R.T
 
-    def add(self, config: Config, params: Params, seen: list[tuple[int, StampedFrame, Estimate]]) -> None:
-        """Take in a few frames. seen: number in the history, frame and estimate of each."""
-        for number, frame, estimate in seen:
-            pose = map_pose(estimate)
-            self.ranges.hear(frame, estimate, pose, params, config.nlos_gap_db)
-            self._roll(frame)
-            informed = np.asarray(estimate.information, float)
-            if len(self.keyframes) and not self._far(pose, frame.stamp, informed):
-                continue
-            if self._broken or not len(self.keyframes):
-                self.ranges.drop()
-            else:
-                last = self.keyframes[-1]
-                stamps = int(last["stamp"]), frame.stamp
-                self.ranges.close(len(self.keyframes) - 1, stamps, (last["pose"], pose))
-            drift = turned(-pose[2], np.asarray(estimate.velocity, float))
-            told = pose, informed, drift, estimate.yaw_rate, self._wheels, self._broken
-            self.keyframes.append((frame.stamp, number, *told))
-            self.scans.append(_packed(frame.frame.scan) if _sees(frame) else None)
-            self._wheels, self._broken = np.zeros(3), False
-            if self.scans[-1] is not None:
-                self._tie(params)
-            self._thin()
+    def add(self, config: Config, params: Params, number: int, frame: StampedFrame, estimate: Estimate) -> None:
+        """Take in one frame. number: in the history."""
+        pose = map_pose(estimate)
+        self.ranges.hear(frame, estimate, pose, params, config.nlos_gap_db)
+        self._roll(frame)
+        informed = np.asarray(estimate.information, float)
+        if len(self.keyframes) and not self._far(pose, frame.stamp, informed):
+            return
+        if self._broken or not len(self.keyframes):
+            self.ranges.drop()
+        else:
+            last = self.keyframes[-1]
+            stamps = int(last["stamp"]), frame.stamp
+            self.ranges.close(len(self.keyframes) - 1, stamps, (last["pose"], pose))
+        drift = turned(-pose[2], np.asarray(estimate.velocity, float))
+        told = pose, informed, drift, estimate.yaw_rate, self._wheels, self._broken
+        self.keyframes.append((frame.stamp, number, *told))
+        self.scans.append(_packed(frame.frame.scan) if _sees(frame) else None)
+        self._wheels, self._broken = np.zeros(3), False
+        if self.scans[-1] is not None:
+            self._tie(params)
+        self._thin()
 
     def _far(self, pose: np.ndarray, stamp: int, informed: np.ndarray) -> bool:
         last = self.keyframes[-1]

@@ -183,17 +183,18 @@ class Session:
         return Buffer(antenna, height, bias, float(p.sigma_n), float(p.bias_scale))
 
     def _take(self, frame: StampedFrame, estimate: Estimate) -> None:
+        if self._looks_back:
+            # not with the look: what that takes comes on top for one frame in ten
+            self.graph.add(
+                self.config, self._params_on_host(), len(self.history.stamps) + len(self._pending), frame, estimate
+            )
         self._pending.append((frame, estimate))
         if len(self._pending) == CONTROL_EVERY:
             self._look()
 
     def _look(self) -> None:
         pending, self._pending = self._pending, []
-        first = len(self.history.stamps)
         self.history.add(pending, self.hypotheses)
-        numbered = [(first + k, frame, estimate) for k, (frame, estimate) in enumerate(pending)]
-        if self._looks_back:
-            self.graph.add(self.config, self._params_on_host(), numbered)
         if not self.settings.filter.lidar_only:
             if self.decided_at is None:
                 self._start_up(pending)
