@@ -206,9 +206,11 @@ class Graph:
 
     def _far(self, pose: np.ndarray, stamp: int, informed: np.ndarray) -> bool:
         last = self.keyframes[-1]
-        moved = relative(last["pose"], pose)
-        late = stamp - last["stamp"] > _BLIND_S * 1e9 and bool(_blind(informed[None])[0])
-        return bool(self._broken or np.hypot(*moved[:2]) > _MOVED[0] or abs(wrapped(moved[2])) > _MOVED[1] or late)
+        # plain numbers: asked for every frame
+        (x, y, yaw), (x0, y0, yaw0) = pose.tolist(), last["pose"].tolist()
+        turn = math.remainder(yaw - yaw0, 2 * math.pi)
+        late = stamp - int(last["stamp"]) > _BLIND_S * 1e9 and bool(_blind(informed[None])[0])
+        return self._broken or math.hypot(x - x0, y - y0) > _MOVED[0] or abs(turn) > _MOVED[1] or late
 
     def _roll(self, frame: StampedFrame) -> None:
         odometry = frame.frame.odometry

@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uwbslam_jax import memory
 from uwbslam_jax.graph import Graph, relative, wrapped
 from uwbslam_jax.keyframes import mean_sigma, turned
 from uwbslam_jax.multilateration import DECIDED, soften
@@ -79,7 +78,6 @@ def solve(
     if problem is None:
         return None
     x = problem.start(poses, places)
-    memory.give_back()
     calibrated = problem.minimise(x, CALIBRATED_M)
     freed = problem.minimise(calibrated[0], BIASED_M)
     biased = biased or calibrated[1] - freed[1] > DECIDED + 3.0 * len(problem.slots)

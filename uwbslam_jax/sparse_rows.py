@@ -16,6 +16,8 @@ from uwbslam_jax import memory
 
 _BLOCK = 2048
 """So many rows are put together at a time."""
+_LARGE = 500_000
+"""Entries of normal equations that take memory worth the milliseconds of handing it back: some 3000 keyframes."""
 
 
 @runtime_checkable
@@ -145,6 +147,6 @@ def _linearised(fill: Callable[[np.ndarray, Sink], None], x: np.ndarray, rank: n
     rows = Rows(rank)
     fill(x, rows)
     normal = rows.normal()
-    # the sums on the way left holes twice its size, and a factorisation is still to come
-    memory.give_back()
+    if normal.A.nnz > _LARGE:  # the sums on the way left holes of twice its size, and a factorisation is still to come
+        memory.give_back()
     return normal
