@@ -10,9 +10,11 @@ import small_room as room
 from test_session import BEACONS, SETTINGS, Drive, assert_same_bits, pose_at
 
 from uwbslam_jax.config import FilterSettings, UwbSettings
-from uwbslam_jax.graph import wrapped
-from uwbslam_jax.hindsight import _track
+from uwbslam_jax.graph import KEYFRAME, Graph, wrapped
+from uwbslam_jax.hindsight import Question, _track
 from uwbslam_jax.metrics import rigid_fit
+from uwbslam_jax.range_means import RangeMeans
+from uwbslam_jax.revision import Reviser
 from uwbslam_jax.session import CONTROL_EVERY, Session
 
 NODES = (10, 20, 30)
@@ -157,3 +159,21 @@ def test_between_keyframes_a_direction_that_is_not_seen_is_even(finished) -> Non
     finally:
         history.sight.values[:], history.map_poses.values[:] = sight, seen
     assert np.all(np.abs(wrapped(track[:, 2] - run.hindsight.track[:, 2])) < 1e-5)  # the history is in single precision
+
+
+@pytest.mark.parametrize(("keyframes", "looks"), [(24, 5), (2500, 100)])
+def test_a_revision_may_take_the_longer_the_longer_the_run_is(finished, keyframes: int, looks: int) -> None:
+    """The host waits for one that is due: with a fixed delay a long run would stand still for it."""
+    graph = Graph(RangeMeans(0.1))
+    graph.keyframes.extend(np.zeros(keyframes, KEYFRAME))
+    run, reviser = finished[0], Reviser()
+    question = Question(graph, np.zeros((keyframes, 3)), {}, run.params, ((1, 0), (2, 0)), False)
+    reviser.begin(run.config, run.params, question, 0.05, 0.0)
+    for _ in range(looks - 1):
+        assert reviser.look(lambda solution: True) is None
+        assert not reviser.wants(10 * keyframes)
+    while not reviser.wants(10 * keyframes):
+        assert reviser.look(lambda solution: True) is None
+        looks += 1
+    reviser.close()
+    assert looks < 10 + keyframes

@@ -232,3 +232,23 @@ def test_normal_equations_are_those_of_the_rows(monkeypatch) -> None:
     np.testing.assert_allclose(A.toarray()[np.ix_(rank, rank)], J.T @ J, rtol=1e-9, atol=1e-6)
     np.testing.assert_allclose(b[rank], J.T @ r, rtol=1e-9, atol=1e-6)
     np.testing.assert_allclose(cost.cost, 0.5 * r @ r)
+
+
+def test_unknowns_are_eliminated_in_an_order_that_keeps_the_factor_sparse() -> None:
+    """Each unknown once; the factor of a track of many rounds has few more entries than the equations themselves, and
+    many times fewer than where the places, on which every pose hangs, go first."""
+    truth = np.tile(loop(40), (5, 1))
+    graph = make(truth)
+    places = {(slot, 0): spot for slot, spot in BEACONS.items()}
+    problem = smoothing.Problem.build(graph, graph.poses(), places, np.zeros(K), np.zeros(K), 0.0)
+    assert sorted(problem.rank) == list(range(problem.size))
+
+    def entries(rank: np.ndarray) -> tuple[int, int]:
+        rows = sparse_rows.Rows(rank)
+        problem._rows(np.zeros(3), 0.3, (30.0, 2.0))(problem.start(graph.poses(), places), rows)
+        A = rows.normal().A
+        return A.nnz // 2, sparse_rows._factor(A.T).L.nnz
+
+    lower, factor = entries(problem.rank)
+    assert factor < 1.5 * lower
+    assert factor < 0.2 * entries(problem.size - 1 - problem.rank)[1]
