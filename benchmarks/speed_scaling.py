@@ -100,7 +100,7 @@ class Case:
         """Seconds of one more step."""
         frame = self.frame()
         begin = time.perf_counter()
-        self.state, _ = compiled.step_once(self._config, self._params, self.state, frame)
+        self.state, _ = compiled.step(self._config, self._params, self.state, [frame])
         jax.block_until_ready(self.state)
         return time.perf_counter() - begin
 

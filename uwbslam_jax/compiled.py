@@ -1,4 +1,8 @@
-"""The step as it is compiled: one vector in, one out, one by one or as a scan over several; both give the same bits."""
+"""The step as it is compiled: one vector in, one out, for one frame or several.
+
+It is one program whatever the number of frames is: two would round differently now and then, however alike
+they are, and a live run and its recording would part.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +11,13 @@ from collections.abc import Sequence
 from functools import cache, partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
 from uwbslam_jax import slam
 from uwbslam_jax.config import Config, Params, Settings, UwbSettings, make_params
-from uwbslam_jax.measurements import Frame, StampedFrame, empty_frame
+from uwbslam_jax.measurements import Frame, empty_frame
 from uwbslam_jax.packing import Packing
 from uwbslam_jax.slam import Estimate, State
 
@@ -20,20 +25,18 @@ TRACES: Counter[str] = Counter()
 """How often each compiled function was traced, by name; a test counts them."""
 
 
-def step_once(config: Config, params: Params, state: State, frame: Frame) -> tuple[State, Estimate]:
-    """One compiled step; the state's buffers are reused. The estimate is on the host."""
-    frames, estimates = _packings(config)
-    state, told = _step_once(config, params, state, frames.pack(frame))
-    return state, estimates.unpack(np.asarray(told))
+GROUP = 10
+"""So many frames at most."""
 
 
-def step_many(
-    config: Config, params: Params, state: State, frames: Sequence[StampedFrame]
-) -> tuple[State, list[Estimate]]:
-    """Steps over frames in order, as one compiled scan."""
+def step(config: Config, params: Params, state: State, frames: Sequence[Frame]) -> tuple[State, list[Estimate]]:
+    """Steps over at most GROUP frames in order; the state's buffers are reused. The estimates are on the host."""
     packing, estimates = _packings(config)
-    state, told = _step_many(config, params, state, np.stack([packing.pack(frame.frame) for frame in frames]))
-    return state, [estimates.unpack(row) for row in np.asarray(told)]
+    packed = np.zeros((GROUP, packing.size), np.float32)
+    for row, frame in zip(packed, frames, strict=False):
+        packing.pack(frame, row)
+    state, told = _step(config, params, state, packed, np.int32(len(frames)))
+    return state, [estimates.unpack(row) for row in np.asarray(told)[: len(frames)]]
 
 
 @cache
@@ -51,20 +54,13 @@ def _reported(estimate: Estimate) -> Estimate:
 
 
 @partial(jax.jit, static_argnums=0, donate_argnums=2)
-def _step_once(config, params, state, frame):
-    TRACES["step_once"] += 1
-    return _guarded(config, params, state, frame)
+def _step(config, params, state, frames, count):
+    TRACES["step"] += 1
+    packing, estimates = _packings(config)
 
+    def one(k, carry):
+        state, told = carry
+        state, estimate = slam.step(config, params, state, packing.unpack(frames[k]))
+        return state, told.at[k].set(estimates.pack_device(_reported(estimate)))
 
-@partial(jax.jit, static_argnums=0, donate_argnums=2)
-def _step_many(config, params, state, frames):
-    TRACES["step_many"] += 1
-    return lax.scan(lambda s, f: _guarded(config, params, s, f), state, frames)
-
-
-def _guarded(config, params, state, frame):
-    # without the barriers the compiler fuses the step with the loop around it and rounds differently there
-    state, frame = lax.optimization_barrier((state, frame))
-    frames, estimates = _packings(config)
-    state, estimate = lax.optimization_barrier(slam.step(config, params, state, frames.unpack(frame)))
-    return state, estimates.pack_device(_reported(estimate))
+    return lax.fori_loop(0, count, one, (state, jnp.zeros((GROUP, estimates.size))))

@@ -31,15 +31,13 @@ class Packing(Generic[T]):
         self._slices = [slice(begin, end) for begin, end in zip([0, *ends], ends, strict=False)]
         self.size = ends[-1]
 
-    def pack(self, tree: T) -> Float[np.ndarray, "size"]:
-        """A tree on the host as a vector."""
-        vector = np.empty(self.size, np.float32)
+    def pack(self, tree: T, vector: Float[np.ndarray, "size"]) -> None:
+        """A tree on the host into a vector."""
         for leaf, part in zip(jax.tree.leaves(tree), self._slices, strict=True):
             vector[part] = leaf.ravel()
-        return vector
 
     def pack_device(self, tree: T) -> Float[Array, "size"]:
-        """The same inside a compiled function."""
+        """A tree inside a compiled function as a vector."""
         return jnp.concatenate([leaf.ravel().astype(jnp.float32) for leaf in jax.tree.leaves(tree)])
 
     def unpack(self, vector: Any) -> T:

@@ -1,6 +1,6 @@
 """A recording through the estimator: messages -> frames -> session -> Result. Reads no other file and writes none.
 
-Batch mode steps groups of frames as one compiled scan, online mode steps frame by frame; both give the same bits.
+Batch mode steps groups of frames at once, online mode steps frame by frame; both give the same bits.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Every CONTROL_EVERY frames the host looks at what the steps reported: it decides the start-up, places beacons that
 joined, drops those that fell silent, and moves the map's window. The steps in between run without it, one by one
-(online) or as one compiled scan (batch); both give the same bits.
+(online) or ten at a time (batch); it is the same compiled program, and gives the same bits.
 """
 
 from __future__ import annotations
@@ -15,9 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from uwbslam_jax import layout, slam, startup
+from uwbslam_jax import compiled, layout, slam, startup
 from uwbslam_jax.beacons import BeaconKeeper
-from uwbslam_jax.compiled import step_many, step_once
 from uwbslam_jax.config import Params, Settings, make_config, make_params
 from uwbslam_jax.graph import Graph
 from uwbslam_jax.hindsight import Hindsight, Question, look_back
@@ -32,7 +31,7 @@ from uwbslam_jax.slam import Estimate, State
 from uwbslam_jax.smoothing import Solution
 from uwbslam_jax.tiles import Tiles
 
-CONTROL_EVERY = 10
+CONTROL_EVERY = compiled.GROUP
 """Frames between two looks of the host."""
 _NOTABLE_BIAS = 0.3
 """A bias larger than this share of sigma_n is told; smaller ones only take up what little was learnt of them."""
@@ -107,18 +106,18 @@ class Session:
     def step(self, frame: StampedFrame) -> Estimate:
         """One frame in, its estimate out (numpy)."""
         self._learn_slots(frame)
-        self.state, estimate = step_once(self.config, self.params, self.state, frame.frame)
+        self.state, (estimate,) = compiled.step(self.config, self.params, self.state, [frame.frame])
         if self.listener is not None:
             self.listener(frame, estimate)
         self._take(frame, estimate)
         return estimate
 
     def steps(self, frames: Sequence[StampedFrame]) -> list[Estimate]:
-        """The same for as many frames as there is room for, as one compiled scan."""
+        """The same for as many frames as there is room for, all at once."""
         if len(frames) != CONTROL_EVERY or self._pending:
             return [self.step(frame) for frame in frames]
         self._learn_slots(frames[-1])
-        self.state, estimates = step_many(self.config, self.params, self.state, frames)
+        self.state, estimates = compiled.step(self.config, self.params, self.state, [f.frame for f in frames])
         for frame, estimate in zip(frames, estimates, strict=True):
             self._take(frame, estimate)
         return estimates
