@@ -167,6 +167,8 @@ def test_compiled_steps_give_the_same_bits_with_beacons_in_the_state():
     assert_same_bits(estimates, many)
     assert max(float(np.max(estimate.weight)) for estimate in many) > 0
     assert any(bool(estimate.drawn) for estimate in many)
+    with pytest.raises(ValueError):
+        compiled.step(run.config, run.params, start(), [frame.frame for frame in frames])
 
 
 def test_fewer_frames_than_a_chunk_are_stepped_one_by_one():

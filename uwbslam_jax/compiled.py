@@ -30,10 +30,14 @@ GROUP = 10
 
 
 def step(config: Config, params: Params, state: State, frames: Sequence[Frame]) -> tuple[State, list[Estimate]]:
-    """Steps over at most GROUP frames in order; the state's buffers are reused. The estimates are on the host."""
+    """Steps over at most GROUP frames in order; the state's buffers are reused. The estimates are on the host.
+
+    Raises:
+      ValueError: more frames than that.
+    """
     packing, estimates = _packings(config)
     packed = np.zeros((GROUP, packing.size), np.float32)
-    for row, frame in zip(packed, frames, strict=False):
+    for row, frame in zip(packed[: len(frames)], frames, strict=True):
         packing.pack(frame, row)
     state, told = _step(config, params, state, packed, np.int32(len(frames)))
     return state, [estimates.unpack(row) for row in np.asarray(told)[: len(frames)]]

@@ -54,8 +54,8 @@ def to_result(session: Session, facts: Facts) -> Result:
     """
     history = session.history
     scans = bool(history.has_scan.values.any())
-    told_of = np.asarray(history.has_scan) if scans or not facts.odometry_used else np.ones(len(history.stamps), bool)
-    at = slice(None) if told_of.all() else np.flatnonzero(told_of)  # nothing is copied where it is all of them
+    kept = history.has_scan.values if scans or not facts.odometry_used else np.ones(len(history.stamps), bool)
+    at = slice(None) if kept.all() else np.flatnonzero(kept)  # nothing is copied where it is all of them
     told = [] if scans else [_NO_SCAN if facts.odometry_used else _NO_TRACK]
     told += [] if facts.relative is None else [_RELATIVE]
     told += _biases(session)

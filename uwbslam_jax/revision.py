@@ -99,8 +99,10 @@ class Reviser:
         self._pool = self._pool or ThreadPoolExecutor(1, thread_name_prefix="revision")
         self._job = _Job(config, params, question, resolution, epoch)
         self._begun_with = len(question.graph.keyframes)
-        self._due = _LOOKS + self._begun_with // _KEYFRAMES_A_LOOK
-        self._running = self._pool.submit(self._job.solve)
+        self._wait_for(self._pool.submit(self._job.solve))
+
+    def _wait_for(self, running: Future[Solution | None] | Future[Revision]) -> None:
+        self._running, self._due = running, _LOOKS + self._begun_with // _KEYFRAMES_A_LOOK
 
     def look(self, news: Callable[[Solution], bool]) -> Revision | None:
         """The revision that is due at this look of the host; waited for if need be.
@@ -118,8 +120,8 @@ class Reviser:
             return found if news(found.solution) else None
         self.solved += found is not None
         if found is not None and news(found):
-            self._job, self._running = job, self._pool.submit(job.draw, found)
-            self._due = _LOOKS + self._begun_with // _KEYFRAMES_A_LOOK
+            self._job = job
+            self._wait_for(self._pool.submit(job.draw, found))
         return None
 
     def drop(self) -> None:
