@@ -22,9 +22,12 @@ from jax import lax
 from benchmarks.bound_fused import fused
 from benchmarks.bound_recursion import Covariances, recursion
 from benchmarks.metric import Metric, Report
-from uwbslam_jax import layout, motion, ranging, trust
-from uwbslam_jax.config import Settings, UwbSettings, make_config, make_params
-from uwbslam_jax.ekf import Gaussian, symmetric_root
+from uwbslam_jax.estimator import state_vector
+from uwbslam_jax.estimator import motion
+from uwbslam_jax.estimator import ranging
+from uwbslam_jax.estimator import match_fusion
+from uwbslam_jax.settings import Settings, UwbSettings, make_config, make_params
+from uwbslam_jax.numerics.gaussian import Gaussian, symmetric_root
 from uwbslam_jax.measurements import Ranges, empty_frame
 
 RUNS = 50
@@ -119,7 +122,7 @@ def _covariances(start: Gaussian, F: Any, Q: np.ndarray, H: Any, sigma: float) -
 
 
 def _start(k: int) -> Gaussian:
-    mean, std = np.zeros(layout.state_size(k), np.float32), np.full(layout.state_size(k), 1e-5, np.float32)
+    mean, std = np.zeros(state_vector.state_size(k), np.float32), np.full(state_vector.state_size(k), 1e-5, np.float32)
     mean[:2], mean[2 : 2 * k] = (6.0, 12.0), _BEACONS.ravel()
     std[:2], std[2 : 2 * k], std[2 * k : 2 * k + 2] = _PRIOR["place"], _PRIOR["beacon"], _PRIOR["speed"]
     std[[2, 3, 5]] = _FRAME_M
@@ -137,7 +140,7 @@ def _ranges(z: jax.Array) -> Ranges:
 
 
 def _moved(x: jax.Array) -> jax.Array:
-    return motion.transition(x, jnp.float32(_DT), _STILL, jnp.zeros(layout.node_count(x.shape[0]), bool))
+    return motion.transition(x, jnp.float32(_DT), _STILL, jnp.zeros(state_vector.node_count(x.shape[0]), bool))
 
 
 def _slope(params, x: jax.Array) -> jax.Array:
@@ -147,8 +150,8 @@ def _slope(params, x: jax.Array) -> jax.Array:
 def _noise(params, x: jax.Array) -> jax.Array:
     """Q, as the filter has it: what a prediction adds to a covariance of nothing."""
     nothing = Gaussian(x, jnp.zeros((x.shape[0], x.shape[0])))
-    calm = jnp.array(trust.CALM) ** 2
-    moving = jnp.zeros(layout.node_count(x.shape[0]), bool)
+    calm = jnp.array(match_fusion.CALM) ** 2
+    moving = jnp.zeros(state_vector.node_count(x.shape[0]), bool)
     return motion.predict(nothing, params, jnp.float32(_DT), _STILL, moving, calm).cov
 
 
@@ -158,8 +161,8 @@ def _run(params, start: Gaussian, key: jax.Array) -> tuple[jax.Array, jax.Array]
     first, rest = jax.random.split(key)
     x = start.mean + jnp.sqrt(jnp.diagonal(start.cov)) * jax.random.normal(first, (n,))
     root = symmetric_root(_noise(params, start.mean))
-    moving, every = jnp.zeros(layout.node_count(n), bool), jnp.ones(len(_PAIRS), bool)
-    calm = jnp.array(trust.CALM) ** 2
+    moving, every = jnp.zeros(state_vector.node_count(n), bool), jnp.ones(len(_PAIRS), bool)
+    calm = jnp.array(match_fusion.CALM) ** 2
 
     def step(carry, key):
         x, belief, scatter = carry
@@ -171,7 +174,7 @@ def _run(params, start: Gaussian, key: jax.Array) -> tuple[jax.Array, jax.Array]
         belief, _, scatter = ranging.update(belief, _ranges(z), every, params, scatter, robust=True)
         return (x, belief, scatter), (x, belief.mean)
 
-    scatter = ranging.quiet(layout.node_count(n))
+    scatter = ranging.quiet(state_vector.node_count(n))
     return lax.scan(step, (x, start, scatter), jax.random.split(rest, _STEPS))[1]
 
 

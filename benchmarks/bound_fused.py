@@ -9,14 +9,14 @@ import numpy as np
 
 from benchmarks.bound_recursion import recursion
 from benchmarks.metric import Metric
-from uwbslam_jax import trust
-from uwbslam_jax.conditions import Scenario
-from uwbslam_jax.config import MapSettings
-from uwbslam_jax.metrics import align, wrap
-from uwbslam_jax.rays import strike
-from uwbslam_jax.run import run_messages
-from uwbslam_jax.settings_file import from_dict
-from uwbslam_jax.simulate import scenario, settings_overrides, simulate
+from uwbslam_jax.estimator import match_fusion
+from uwbslam_jax.sim.scenario import Scenario
+from uwbslam_jax.settings import MapSettings
+from uwbslam_jax.evaluation import align, wrap
+from uwbslam_jax.sim.rays import strike
+from uwbslam_jax.api import run_messages
+from uwbslam_jax.files.settings_file import from_dict
+from uwbslam_jax.sim.simulate import scenario, settings_overrides, simulate
 
 _FIRST_SEED, _SECONDS = 500, 60.0
 _DT = 0.1
@@ -34,7 +34,7 @@ def fused(runs: int, bar: float) -> list[Metric]:
         rows.append(_one(replace(scenario("hall", seed, _SECONDS))))
         print(f"fused {seed}: {np.round(rows[-1], 5).tolist()}", file=sys.stderr, flush=True)
     beacons, robot, heading, online, online_heading, least_beacons, least_robot, least_heading = np.array(rows).T
-    deg, floor = 180 / np.pi, trust._MATCH_FLOOR
+    deg, floor = 180 / np.pi, match_fusion._MATCH_FLOOR
 
     def rms(squares: np.ndarray) -> float:
         return float(np.sqrt(np.mean(squares)))

@@ -9,12 +9,12 @@ import numpy as np
 
 from benchmarks import intervals
 from benchmarks.trials import Outcome, measure
-from uwbslam_jax.conditions import Scenario
-from uwbslam_jax.config import FilterSettings, Settings
-from uwbslam_jax.metrics import rigid_fit, wrap
-from uwbslam_jax.paths import Along, Path, Rest, Track
+from uwbslam_jax.sim.scenario import Scenario
+from uwbslam_jax.settings import FilterSettings, Settings
+from uwbslam_jax.evaluation import rigid_fit, wrap
+from uwbslam_jax.sim.paths import Along, Path, Rest, Track
 from uwbslam_jax.result import MapImage, Result
-from uwbslam_jax.simulate import scenario
+from uwbslam_jax.sim.simulate import scenario
 
 LENGTH = 22.7
 """Of the corridor [m]."""

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from uwbslam_jax.config import MapSettings, RobotSettings, Settings, UwbSettings
+from uwbslam_jax.settings import MapSettings, RobotSettings, Settings, UwbSettings
 from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, TruthMessage
 
 LIGHT = 299.792458

@@ -31,11 +31,11 @@ _COLUMNS = {
 def measure(log: Path, *, odometry: bool) -> dict[str, float | None]:
     """Figures of one run of a recording."""
     from benchmarks.sharpness import scan_misfit
-    from uwbslam_jax.config import OdomSettings, Settings
-    from uwbslam_jax.mcap_log import LogReader
+    from uwbslam_jax.settings import OdomSettings, Settings
+    from uwbslam_jax.files.mcap_log import LogReader
     from uwbslam_jax.measurements import ScanMessage
-    from uwbslam_jax.metrics import Truth, consistency, evaluate
-    from uwbslam_jax.run import run_log
+    from uwbslam_jax.evaluation import Truth, consistency, evaluate
+    from uwbslam_jax.api import run_log
 
     settings = dataclasses.replace(Settings(), odom=OdomSettings(use=odometry))
     result, _ = run_log(log, settings)

@@ -48,7 +48,7 @@ def judge(name: str, seed: int, duration: float | None) -> Seed:
     """Simulates one seed, runs it and judges it."""
     # here, not above: a worker process sets up JAX on its own
     from benchmarks.trials import measure
-    from uwbslam_jax.simulate import scenario
+    from uwbslam_jax.sim.simulate import scenario
 
     made = scenario(name, seed, duration)
     outcome = measure(made)

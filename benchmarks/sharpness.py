@@ -7,8 +7,8 @@ from collections.abc import Iterable
 import numpy as np
 
 from uwbslam_jax.measurements import ScanMessage
-from uwbslam_jax.metrics import RigidMotion, rigid_fit
-from uwbslam_jax.outputs import OCCUPIED_THRESHOLD
+from uwbslam_jax.evaluation import RigidMotion, rigid_fit
+from uwbslam_jax.files.run_folder import OCCUPIED_THRESHOLD
 from uwbslam_jax.result import MapImage
 
 _FITTED = 2000

@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.metric import Metric, Report, ratio
 from benchmarks.speed_scaling import Case, sized
-from uwbslam_jax.config import MapSettings, Settings, UwbSettings
+from uwbslam_jax.settings import MapSettings, Settings, UwbSettings
 
 _RUNS = (1, 64, 1024, 4096)
 _STEPS = 10

@@ -19,11 +19,11 @@ import numpy as np
 from mcap.reader import make_reader
 
 from benchmarks.metric import Metric, Report
-from uwbslam_jax.config import LidarSettings
-from uwbslam_jax.mcap_log import LogReader
-from uwbslam_jax.metrics import Truth, evaluate
-from uwbslam_jax.outputs import read_run, read_trajectory
-from uwbslam_jax.recorder import DROPPED
+from uwbslam_jax.settings import LidarSettings
+from uwbslam_jax.files.mcap_log import LogReader
+from uwbslam_jax.evaluation import Truth, evaluate
+from uwbslam_jax.files.run_folder import read_run, read_trajectory
+from uwbslam_jax.live.recorder import DROPPED
 
 _WORDS = [sys.executable, "-m", "uwbslam_jax"]
 _SETTLED_S = 120.0
@@ -178,9 +178,9 @@ def _emulated(folder: Path, truth: Path) -> Iterator[tuple[str, str]]:
 
 def _robot_of_the_workshop(folder: Path) -> Path:
     """A settings file with what a user would configure for this robot."""
-    from uwbslam_jax.conditions import settings_overrides
-    from uwbslam_jax.settings_file import dump, from_dict
-    from uwbslam_jax.simulate import scenario
+    from uwbslam_jax.sim.scenario import settings_overrides
+    from uwbslam_jax.files.settings_file import dump, from_dict
+    from uwbslam_jax.sim.simulate import scenario
 
     path = folder / "robot.toml"
     path.write_text(dump(from_dict(settings_overrides(scenario("workshop", 0, None)))), encoding="utf-8")

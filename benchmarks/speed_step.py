@@ -12,15 +12,21 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.metric import Metric, Report, ratio, spread
-from uwbslam_jax import compiled, grid, layout, motion, ranging, slam, surfaces
-from uwbslam_jax.config import Settings
-from uwbslam_jax.frames import FrameAssembler
-from uwbslam_jax.geometry import rotation
+from uwbslam_jax.estimator import compiled
+from uwbslam_jax.mapping import grid
+from uwbslam_jax.estimator import state_vector
+from uwbslam_jax.estimator import motion
+from uwbslam_jax.estimator import ranging
+from uwbslam_jax.estimator import step
+from uwbslam_jax.mapping import sweep
+from uwbslam_jax.settings import Settings
+from uwbslam_jax.session.frame_assembler import FrameAssembler
+from uwbslam_jax.numerics.se2 import rotation
 from uwbslam_jax.measurements import StampedFrame
-from uwbslam_jax.run import fit_beams
-from uwbslam_jax.session import Session
-from uwbslam_jax.settings_file import from_dict
-from uwbslam_jax.simulate import scenario, settings_overrides, simulate
+from uwbslam_jax.api import fit_beams
+from uwbslam_jax.session.session import Session
+from uwbslam_jax.files.settings_file import from_dict
+from uwbslam_jax.sim.simulate import scenario, settings_overrides, simulate
 
 _SECONDS = 150.0
 _WARM = 400
@@ -114,23 +120,23 @@ def _parts(run: Session, frames: list[StampedFrame]) -> list[tuple[str, float]]:
     """Median seconds of the step's parts, each compiled alone, on the state at the end of a run."""
     config, params, frame = run.config, run.params, jax.tree.map(jnp.asarray, frames[-1].frame)
     state = run.state
-    s = layout.unpack(state.belief.mean)
-    sweep = slam.undo_motion(frame.scan, params.lidar, rotation(-s.heading) @ s.velocities[0], s.yaw_rate)
-    usable = slam._usable(config, state, frame)
+    s = state_vector.unpack(state.belief.mean)
+    sweep = step.undo_motion(frame.scan, params.lidar, rotation(-s.heading) @ s.velocities[0], s.yaw_rate)
+    usable = step._usable(config, state, frame)
 
     def filtered(state, frame):
         belief = motion.predict(state.belief, params, frame.dt, frame.odometry, state.moving, state.unrest)
         return ranging.update(belief, frame.ranges, usable, params, state.scatter, robust=True)
 
     def matched(state, sweep):
-        surface = surfaces.surface(sweep)
-        return slam._match(config, params, state, state.belief, sweep, surface, frame.has_scan)
+        surface = sweep.surface(sweep)
+        return step._match(config, params, state, state.belief, sweep, surface, frame.has_scan)
 
     def redrawn(window, pose):
         return grid.integrate(window, pose, sweep, config.resolution)
 
     draw = jax.jit(redrawn, donate_argnums=0)
-    window, pose = jax.tree.map(jnp.array, state.grid), layout.robot_pose(state.belief.mean)
+    window, pose = jax.tree.map(jnp.array, state.grid), state_vector.robot_pose(state.belief.mean)
     times: list[float] = []
     for _ in range(_REPEATS):
         begin = time.perf_counter()

@@ -13,9 +13,9 @@ import numpy as np
 from benchmarks.metric import Metric, Report
 from benchmarks.tuning_cost import cost
 from benchmarks.tuning_links import links
-from uwbslam_jax.conditions import Lidar, Scenario, Uwb, Wheels
-from uwbslam_jax.config import Settings, UwbSettings
-from uwbslam_jax.simulate import scenario, simulate
+from uwbslam_jax.sim.scenario import Lidar, Scenario, Uwb, Wheels
+from uwbslam_jax.settings import Settings, UwbSettings
+from uwbslam_jax.sim.simulate import scenario, simulate
 
 _FIRST_SEED = 300
 """Other worlds than those of the scenario suite."""
@@ -50,9 +50,9 @@ def measure(*, quick: bool) -> Report:
 
 def recovery(quick: bool) -> Iterator[Metric]:
     """Tuned sigma_n over the truth."""
-    from uwbslam_jax.likelihood import Objective, piece
-    from uwbslam_jax.rollout import prepare
-    from uwbslam_jax.tuning import fit
+    from uwbslam_jax.tuning.likelihood import Objective, piece
+    from uwbslam_jax.tuning.rollout import prepare
+    from uwbslam_jax.tuning.fit import fit
 
     names, seconds = ("sigma_n", "sigma_w"), []
     for k, sigma in enumerate(_SIGMAS[: 1 if quick else None]):
@@ -84,18 +84,18 @@ def transfer(quick: bool) -> Iterator[Metric]:
 def _pair(k: int) -> tuple[float, float, float]:
     """Gain in log-likelihood a frame, robot and beacons over what the defaults give."""
     from benchmarks.trials import measure as run
-    from uwbslam_jax import tunable
-    from uwbslam_jax.likelihood import Objective, piece
-    from uwbslam_jax.rollout import prepare
-    from uwbslam_jax.tuning import fit
+    from uwbslam_jax.tuning import parameters
+    from uwbslam_jax.tuning.likelihood import Objective, piece
+    from uwbslam_jax.tuning.rollout import prepare
+    from uwbslam_jax.tuning.fit import fit
 
     def hall(seed: int) -> Scenario:
         return replace(scenario("hall", seed, _SECONDS), uwb=Uwb(sigma=_TRUE_N))
 
-    names, default = tunable.DEFAULTS["robust"], Settings()
-    start = np.log([tunable.value(default, name) for name in names])
+    names, default = parameters.DEFAULTS["robust"], Settings()
+    start = np.log([parameters.value(default, name) for name in names])
     found = fit(Objective([piece(prepare(list(simulate(hall(_FIRST_SEED + 40 + k))), default))], names, start))
-    tuned = tunable.configured(default, dict(zip(names, found.values.tolist(), strict=True)))
+    tuned = parameters.configured(default, dict(zip(names, found.values.tolist(), strict=True)))
     print(f"pair {k + 1}: {dict(zip(names, found.values.round(4).tolist(), strict=True))}", file=sys.stderr)
     other = hall(_FIRST_SEED + 50 + k)
     seen = Objective([piece(prepare(list(simulate(other)), default), held=0.0)], names, start)
@@ -113,7 +113,7 @@ def _per_frame(objective, logs: np.ndarray) -> np.ndarray:
 
 def mounting(quick: bool) -> Iterator[Metric]:
     """Biases and the LiDAR's place, found from nothing."""
-    from uwbslam_jax.calibration import calibrate
+    from uwbslam_jax.tuning.calibration import calibrate
 
     errors, without = [], scenario("biased", _FIRST_SEED + 30)
 

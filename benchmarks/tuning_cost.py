@@ -11,14 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.metric import Metric
-from uwbslam_jax import layout, tunable, worlds
-from uwbslam_jax.conditions import Beacon, Scenario, stream
-from uwbslam_jax.config import Settings
-from uwbslam_jax.paths import Along, Path, Rest, Track
-from uwbslam_jax.rollout import checkpointed, cropped, losses, prepare, rescaled
-from uwbslam_jax.scenarios import spread
-from uwbslam_jax.simulate import simulate
-from uwbslam_jax.tiles import TILE
+from uwbslam_jax.estimator import state_vector
+from uwbslam_jax.tuning import parameters
+from uwbslam_jax.sim import worlds
+from uwbslam_jax.sim.scenario import Beacon, Scenario, stream
+from uwbslam_jax.settings import Settings
+from uwbslam_jax.sim.paths import Along, Path, Rest, Track
+from uwbslam_jax.tuning.rollout import checkpointed, cropped, losses, prepare, rescaled
+from uwbslam_jax.sim.catalogue import spread
+from uwbslam_jax.sim.simulate import simulate
+from uwbslam_jax.mapping.tiled_map import TILE
 
 _STEPS = 1521
 """39 chunks of 39, not below 1500."""
@@ -37,13 +39,13 @@ def cost(quick: bool) -> Iterator[Metric]:
     assert ready.count >= steps
     frames = jax.tree.map(lambda x: x[:steps], ready.frames)
     config, params = replace(ready.config, cells=_CELLS), ready.params
-    middle = np.asarray(layout.unpack(ready.state.belief.mean).positions[1:], float).mean(0)
+    middle = np.asarray(state_vector.unpack(ready.state.belief.mean).positions[1:], float).mean(0)
     tile = TILE * config.resolution
     origin = np.round((middle - 0.5 * _CELLS * config.resolution) / tile) * tile
     state = ready.state._replace(grid=cropped(ready.state.grid, config.resolution, origin, _CELLS))
 
     def total(logs, state, frames):
-        tuned = tunable.put(params, _NAMES, logs)
+        tuned = parameters.put(params, _NAMES, logs)
         told = checkpointed(config, tuned, rescaled(tuned, params, state), frames)
         return jnp.sum(told.ranges) + jnp.sum(told.matches)
 

@@ -12,8 +12,8 @@ import optimistix as optx
 
 from benchmarks.metric import Metric
 from benchmarks.public_logs import P2P_OFFSET, p2p
-from uwbslam_jax import ranging
-from uwbslam_jax.config import Settings
+from uwbslam_jax.estimator import ranging
+from uwbslam_jax.settings import Settings
 from uwbslam_jax.measurements import RangeMessage
 
 _DATA = Path(__file__).parents[2] / "shared" / "data" / "p2p"

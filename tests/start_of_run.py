@@ -6,9 +6,9 @@ from collections import deque
 
 import numpy as np
 
-from uwbslam_jax.config import Settings, UwbSettings
-from uwbslam_jax.frames import pad_scan
-from uwbslam_jax.keyframes import Buffer, Keyframe, Sighting
+from uwbslam_jax.settings import Settings, UwbSettings
+from uwbslam_jax.session.frame_assembler import pad_scan
+from uwbslam_jax.startup.keyframe_buffer import Buffer, Keyframe, Sighting
 from uwbslam_jax.measurements import Frame, Odometry, Ranges, StampedFrame
 
 BEACONS = {1: np.array([-2.0, 4.0]), 2: np.array([6.0, 5.0]), 3: np.array([5.0, -3.0])}

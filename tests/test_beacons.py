@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 import small_room as room
 
-from uwbslam_jax import layout, slam
-from uwbslam_jax.beacons import BeaconKeeper
-from uwbslam_jax.config import Params, Settings, UwbSettings, make_config, make_params
-from uwbslam_jax.frames import pad_scan
+from uwbslam_jax.estimator import state_vector
+from uwbslam_jax.estimator import step
+from uwbslam_jax.beacons.keeper import BeaconKeeper
+from uwbslam_jax.settings import Params, Settings, UwbSettings, make_config, make_params
+from uwbslam_jax.session.frame_assembler import pad_scan
 from uwbslam_jax.measurements import Frame, StampedFrame
-from uwbslam_jax.slam import Estimate, State
+from uwbslam_jax.estimator.step import Estimate, State
 
 SETTINGS = Settings(uwb=UwbSettings(max_beacons=3, sigma_n=0.1))
 CONFIG = make_config(SETTINGS)
@@ -29,13 +30,13 @@ def params(**changed) -> Params:
 
 def known(*slots: int) -> State:
     """A state that has some beacons at their places, known to a centimetre."""
-    state = slam.init(CONFIG)
+    state = step.init(CONFIG)
     active = np.isin(np.arange(4), [0, *slots])
-    s = layout.unpack(state.belief.mean)
+    s = state_vector.unpack(state.belief.mean)
     positions = jnp.asarray(np.where(active[:, None], BEACONS, 0.0), jnp.float32)
     rows = np.array([2 * slot + axis for slot in slots for axis in (0, 1)])
     cov = state.belief.cov.at[rows, rows].set(1e-4)
-    belief = state.belief._replace(mean=layout.pack(s._replace(positions=positions)), cov=cov)
+    belief = state.belief._replace(mean=state_vector.pack(s._replace(positions=positions)), cov=cov)
     return state._replace(belief=belief, active=jnp.asarray(active))
 
 
@@ -115,7 +116,7 @@ class World:
         self.events += [(self.time, slot, text) for slot, text in events]
 
     def position(self, slot: int) -> np.ndarray:
-        return np.asarray(layout.unpack(self.state.belief.mean).positions[slot], float)
+        return np.asarray(state_vector.unpack(self.state.belief.mean).positions[slot], float)
 
 
 def test_a_beacon_that_joins_is_placed_where_it_stands_within_its_stated_covariance():
@@ -260,7 +261,7 @@ def test_a_beacon_is_followed_while_it_is_carried_and_rests_where_it_is_put_down
     np.testing.assert_array_equal(world.state.moving, [False, False, False, True])
     # the keeper puts it where its last second says; the steps between the looks, which follow it, are not run here
     np.testing.assert_allclose(world.position(3), world.positions[3], atol=0.3)
-    velocity = np.asarray(layout.unpack(world.state.belief.mean).velocities[3])
+    velocity = np.asarray(state_vector.unpack(world.state.belief.mean).velocities[3])
     np.testing.assert_allclose(velocity, [1.0, 0.5], atol=0.5)
     world.walk[3] = 0.0
     world.run(4.0, (1, 2, 3))

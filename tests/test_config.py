@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uwbslam_jax import config, settings_file
-from uwbslam_jax.config import ConfigError, Settings
+from uwbslam_jax import settings
+from uwbslam_jax.files import settings_file
+from uwbslam_jax.settings import ConfigError, Settings
 
 positive = st.floats(1e-6, 1e6)
 finite = st.floats(-1e6, 1e6)
@@ -21,9 +22,9 @@ topic = st.text(st.characters(codec="utf-8", categories=("L", "N", "P", "S")), m
 
 settings_strategy = st.builds(
     Settings,
-    robot=st.builds(config.RobotSettings, st.integers(0, 2**32 - 1), st.tuples(finite, finite, finite)),
+    robot=st.builds(settings.RobotSettings, st.integers(0, 2**32 - 1), st.tuples(finite, finite, finite)),
     uwb=st.builds(
-        config.UwbSettings,
+        settings.UwbSettings,
         topic,
         sigma_n=positive,
         nlos_gap_db=st.one_of(positive, st.just(float("inf"))),
@@ -31,10 +32,10 @@ settings_strategy = st.builds(
         height=by_node,
         bias=by_node,
     ),
-    lidar=st.builds(config.LidarSettings, topic, st.floats(0, 1), st.floats(1.1, 100), st.integers(1, 5000)),
-    odom=st.builds(config.OdomSettings, topic, st.booleans(), positive, positive, st.tuples(positive, positive)),
-    map=st.builds(config.MapSettings, st.floats(0.04, 0.2), st.integers(1, 5), st.floats(50, 100)),
-    filter=st.builds(config.FilterSettings, st.sampled_from(["robust", "paper"]), sigma_w=positive, gamma=positive),
+    lidar=st.builds(settings.LidarSettings, topic, st.floats(0, 1), st.floats(1.1, 100), st.integers(1, 5000)),
+    odom=st.builds(settings.OdomSettings, topic, st.booleans(), positive, positive, st.tuples(positive, positive)),
+    map=st.builds(settings.MapSettings, st.floats(0.04, 0.2), st.integers(1, 5), st.floats(50, 100)),
+    filter=st.builds(settings.FilterSettings, st.sampled_from(["robust", "paper"]), sigma_w=positive, gamma=positive),
 )
 
 
@@ -60,7 +61,7 @@ def test_the_design_example_loads(tmp_path: Path) -> None:
     assert settings.uwb.sigma_n == 1.0
     assert type(settings.uwb.sigma_n) is float
     assert settings.uwb.height == {"1": 1.94}
-    assert settings.map == config.MapSettings()
+    assert settings.map == settings.MapSettings()
 
 
 @pytest.mark.parametrize(

@@ -25,8 +25,8 @@ from uwbslam_drivers.ports import SerialPort
 from uwbslam_drivers.source import Reading, parse_url
 from uwbslam_jax.__main__ import main
 from uwbslam_jax.measurements import RangeMessage, ScanMessage
-from uwbslam_jax.metrics import Truth
-from uwbslam_jax.simulate import Scenario, scenario
+from uwbslam_jax.evaluation import Truth
+from uwbslam_jax.sim.simulate import Scenario, scenario
 
 MS = 1_000_000
 PATIENCE = 30.0

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
-from uwbslam_jax import ekf
-from uwbslam_jax.ekf import Gaussian
+from uwbslam_jax.numerics import gaussian
+from uwbslam_jax.numerics.gaussian import Gaussian
 
 
 def random_case(seed: int, n: int = 6, m: int = 9):
@@ -38,7 +38,7 @@ def information_form(H, R, innovation):
 def test_information_update_is_the_textbook_kalman_update(seed):
     mean, cov, H, R, innovation = random_case(seed)
     want_mean, want_cov = textbook(mean, cov, H, R, innovation)
-    after = ekf.update_information(
+    after = gaussian.update_information(
         Gaussian(jnp.asarray(mean), jnp.asarray(cov)), *map(jnp.asarray, information_form(H, R, innovation))
     )
     # float64 with condition numbers up to 1e6
@@ -56,10 +56,10 @@ def test_linear_system_gives_the_kalman_filter_sequence():
     for _ in range(30):
         z = rng.normal(size=1)
         mean, cov = F @ mean, F @ cov @ F.T + Q
-        belief = ekf.predict(belief, jnp.asarray(F) @ belief.mean, jnp.asarray(F), jnp.asarray(Q))
+        belief = gaussian.predict(belief, jnp.asarray(F) @ belief.mean, jnp.asarray(F), jnp.asarray(Q))
         mean, cov = textbook(mean, cov, H, R, z - H @ mean)
         information, gradient = information_form(H, R, z - H @ np.asarray(belief.mean))
-        belief = ekf.update_information(belief, jnp.asarray(information), jnp.asarray(gradient))
+        belief = gaussian.update_information(belief, jnp.asarray(information), jnp.asarray(gradient))
     np.testing.assert_allclose(belief.mean, mean, rtol=1e-9)
     np.testing.assert_allclose(belief.cov, cov, rtol=1e-9)
 
@@ -68,7 +68,7 @@ def test_linear_system_gives_the_kalman_filter_sequence():
 def test_update_keeps_float32_covariance_symmetric_and_positive_definite(seed):
     mean, cov, H, R, innovation = random_case(seed)
     as32 = [jnp.asarray(x, jnp.float32) for x in (mean, cov, *information_form(H, R, innovation))]
-    after = ekf.update_information(Gaussian(*as32[:2]), *as32[2:])
+    after = gaussian.update_information(Gaussian(*as32[:2]), *as32[2:])
     P = np.asarray(after.cov, float)
     scale = np.sqrt(np.diag(P))
     np.testing.assert_allclose(P / np.outer(scale, scale), P.T / np.outer(scale, scale), atol=1e-6)  # a float32 ulp
@@ -78,7 +78,7 @@ def test_update_keeps_float32_covariance_symmetric_and_positive_definite(seed):
 def test_no_information_changes_nothing():
     mean, cov, *_ = random_case(0)
     belief = Gaussian(jnp.asarray(mean, jnp.float32), jnp.asarray(cov, jnp.float32))
-    after = ekf.update_information(belief, jnp.zeros((6, 6)), jnp.zeros(6))
+    after = gaussian.update_information(belief, jnp.zeros((6, 6)), jnp.zeros(6))
     np.testing.assert_array_equal(after.mean, belief.mean)
     scale = np.sqrt(np.diag(cov))
     # the square root adds 8 eps n = 6e-6 to the unit diagonal
@@ -90,7 +90,7 @@ def test_a_state_known_exactly_stays_known_and_spoils_no_other():
     H = np.array([[1.0, 1.0, 0.0]])
     information, gradient = information_form(H, np.array([0.25]), np.array([2.0]))
     belief = Gaussian(jnp.zeros(3), jnp.asarray(cov, jnp.float32))
-    after = ekf.update_information(belief, jnp.asarray(information, jnp.float32), jnp.asarray(gradient, jnp.float32))
+    after = gaussian.update_information(belief, jnp.asarray(information, jnp.float32), jnp.asarray(gradient, jnp.float32))
     # by hand: the innovation of 2 is all the second state's; gain 1 / 1.25
     np.testing.assert_allclose(after.mean, [0.0, 1.6, 0.0], atol=1e-5)
     np.testing.assert_allclose(after.cov, np.diag([0.0, 0.2, 4.0]), atol=3e-5)  # 8 eps n of the largest
@@ -102,7 +102,7 @@ def test_symmetric_root_squares_to_the_covariance_over_twelve_decades():
     A = rng.normal(size=(4, 8))
     correlation = np.corrcoef(A)
     cov = correlation * np.outer(std, std)
-    L = np.asarray(ekf.symmetric_root(jnp.asarray(cov, jnp.float32)), float)
+    L = np.asarray(gaussian.symmetric_root(jnp.asarray(cov, jnp.float32)), float)
     np.testing.assert_allclose(L @ L.T / np.outer(std, std), correlation, atol=1e-5)  # 8 eps n = 4e-6
 
 
@@ -122,10 +122,10 @@ def test_ten_thousand_float32_updates_keep_the_covariance_healthy_and_near_that_
 
     def step(belief, k):
         F32, Q32 = jnp.asarray(F, jnp.float32), jnp.asarray(Q, jnp.float32)
-        belief = ekf.predict(belief, F32 @ belief.mean, F32, Q32)
+        belief = gaussian.predict(belief, F32 @ belief.mean, F32, Q32)
         H, h = jacobian(belief.mean[:2], jnp)
         truth = jnp.sqrt(jnp.sum((place(k, jnp)[None] - jnp.asarray(anchors, jnp.float32)) ** 2, axis=1))
-        belief = ekf.update_information(belief, H.T @ H / variance, H.T @ (truth - h) / variance)
+        belief = gaussian.update_information(belief, H.T @ H / variance, H.T @ (truth - h) / variance)
         P = belief.cov
         spread = jnp.sqrt(jnp.diagonal(P))
         correlation = P / (spread[:, None] * spread[None, :])
@@ -151,7 +151,7 @@ def test_log_likelihood_is_that_of_scipy():
     _, cov, _, _, _ = random_case(1, n=4)
     innovation = np.array([0.1, -2.0, 0.5, 1.0])
     want = multivariate_normal.logpdf(innovation, cov=cov)
-    got = ekf.log_likelihood(jnp.asarray(innovation, jnp.float32), jnp.asarray(cov, jnp.float32))
+    got = gaussian.log_likelihood(jnp.asarray(innovation, jnp.float32), jnp.asarray(cov, jnp.float32))
     np.testing.assert_allclose(got, want, rtol=1e-3)  # float32, condition number 1e5
 
 
@@ -159,7 +159,7 @@ def test_nees_is_the_squared_mahalanobis_distance():
     cov = np.array([[4.0, 1.0], [1.0, 2.0]])
     error = np.array([1.0, -3.0])
     want = error @ np.linalg.solve(cov, error)
-    np.testing.assert_allclose(ekf.nees(jnp.asarray(error), jnp.asarray(cov)), want, rtol=1e-5)  # float32
+    np.testing.assert_allclose(gaussian.nees(jnp.asarray(error), jnp.asarray(cov)), want, rtol=1e-5)  # float32
 
 
 @pytest.mark.usefixtures("x64")
@@ -170,7 +170,7 @@ def test_gradient_of_an_update_agrees_with_finite_differences():
     def value(x):
         root, H, innovation = x
         P = root @ root.T
-        after = ekf.update_information(Gaussian(jnp.asarray(mean), P), H.T @ H, H.T @ innovation)
+        after = gaussian.update_information(Gaussian(jnp.asarray(mean), P), H.T @ H, H.T @ innovation)
         return jnp.sum(after.mean**2) + jnp.sum(jnp.sin(after.cov))
 
     at = (np.linalg.cholesky(cov), H / np.sqrt(R)[:, None], innovation / np.sqrt(R))
@@ -181,7 +181,7 @@ def test_inverse_by_cofactors() -> None:
     rng = np.random.default_rng(7)
     for _ in range(20):
         A = np.eye(3) + rng.normal(size=(3, 3)) @ np.diag([1e3, 1e2, 1e4]) * 0.1
-        np.testing.assert_allclose(ekf.inverse3(jnp.asarray(A, jnp.float32)) @ A, np.eye(3), atol=2e-3)
+        np.testing.assert_allclose(gaussian.inverse3(jnp.asarray(A, jnp.float32)) @ A, np.eye(3), atol=2e-3)
 
 
 @pytest.mark.parametrize("blind", [False, True])
@@ -194,7 +194,7 @@ def test_a_projected_measurement_is_that_of_the_information_form(blind: bool) ->
         before = Gaussian(jnp.asarray(rng.normal(size=9), jnp.float32), jnp.asarray(L @ L.T * 1e-2, jnp.float32))
         root = rng.normal(size=(3, 2 if blind else 3))
         Y, nu = scale * root @ root.T, rng.normal(size=3)
-        told = ekf.update_projected(before, *(jnp.asarray(a, jnp.float32) for a in (C, Y, nu)))
+        told = gaussian.update_projected(before, *(jnp.asarray(a, jnp.float32) for a in (C, Y, nu)))
         P = np.asarray(before.cov, float)
         cov = np.linalg.inv(np.linalg.inv(P) + C.T @ Y @ C)
         np.testing.assert_allclose(told.cov, cov, atol=1e-4 * np.abs(cov).max())
@@ -211,7 +211,7 @@ def test_a_hundred_thousand_matches_keep_the_covariance_healthy() -> None:
         c, q, y = (jnp.asarray(a, dtype) for a in (C, Q, Y))
 
         def step(P, _):
-            return ekf.update_projected(Gaussian(jnp.zeros(8, dtype), P + q), c, y, jnp.zeros(3, dtype)).cov, None
+            return gaussian.update_projected(Gaussian(jnp.zeros(8, dtype), P + q), c, y, jnp.zeros(3, dtype)).cov, None
 
         return np.asarray(jax.jit(lambda P: jax.lax.scan(step, P, length=100_000)[0])(jnp.eye(8, dtype=dtype)), float)
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uwbslam_jax.config import LidarSettings, OdomSettings, Settings, UwbSettings
-from uwbslam_jax.frames import FrameAssembler, pad_scan
+from uwbslam_jax.settings import LidarSettings, OdomSettings, Settings, UwbSettings
+from uwbslam_jax.session.frame_assembler import FrameAssembler, pad_scan
 from uwbslam_jax.measurements import OdometryMessage, RangeMessage, ScanMessage, StampedFrame, TruthMessage
 
 NAN, INF = float("nan"), float("inf")

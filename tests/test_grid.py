@@ -12,10 +12,10 @@ import pytest
 import small_room as room
 from derivatives import assert_gradient, double
 
-from uwbslam_jax import grid as occupancy
-from uwbslam_jax.geometry import transform_points
-from uwbslam_jax.grid import CLAMP, EPOCH_LEVEL, FREE, FREE_REACH_M, HIT, Grid, Sweep
-from uwbslam_jax.slam import undo_motion
+from uwbslam_jax.mapping import grid as occupancy
+from uwbslam_jax.numerics.se2 import transform_points
+from uwbslam_jax.mapping.grid import CLAMP, EPOCH_LEVEL, FREE, FREE_REACH_M, HIT, Grid, Sweep
+from uwbslam_jax.estimator.step import undo_motion
 
 CELLS, LEVELS, RESOLUTION = 64, 2, 0.2
 

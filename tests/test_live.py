@@ -23,10 +23,10 @@ from mcap_ros2.decoder import DecoderFactory
 from test_report import make_result
 
 from uwbslam_jax.__main__ import main
-from uwbslam_jax.mcap_log import LogReader
+from uwbslam_jax.files.mcap_log import LogReader
 from uwbslam_jax.measurements import ScanMessage
-from uwbslam_jax.outputs import read_run, read_trajectory
-from uwbslam_jax.report import write_report
+from uwbslam_jax.files.run_folder import read_run, read_trajectory
+from uwbslam_jax.web.report import write_report
 
 PATIENCE_S = 120.0
 """After this time a test gives up; none of them takes nearly as long."""

@@ -18,8 +18,11 @@ from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from uwbslam_jax import log_summary, mcap_log, mcap_records, ros_types
-from uwbslam_jax.mcap_log import LogError, LogReader, LogWriter
+from uwbslam_jax.files import log_summary
+from uwbslam_jax.files import mcap_log
+from uwbslam_jax.files import mcap_container
+from uwbslam_jax.files import ros_types
+from uwbslam_jax.files.mcap_log import LogError, LogReader, LogWriter
 from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, ScanMessage, TruthMessage
 
 T0 = 1_700_000_000_123_456_789  # ns; no float64 holds it
@@ -371,7 +374,7 @@ class TestBrokenFiles:
     @pytest.mark.parametrize("with_summary", [True, False])
     def test_a_corrupt_chunk_ends_the_reading(self, tmp_path: Path, with_summary: bool) -> None:
         messages: list[Message] = [scan(T0 + k * MS, beams=400) for k in range(100)]
-        with mcap_records.RecordWriter(tmp_path / "a.mcap", chunk_size=20_000) as writer:
+        with mcap_container.RecordWriter(tmp_path / "a.mcap", chunk_size=20_000) as writer:
             channel = writer.add_topic("/scan", "sensor_msgs/msg/LaserScan", SCAN_CHANNEL[3])
             for message in messages:
                 writer.write(channel, ros_types.encode(message)[1], message.stamp)
@@ -425,7 +428,7 @@ class TestBrokenFiles:
         path = write_raw(
             tmp_path / "a.mcap", {"/scan": ros_channel(schema)}, [("/scan", t, data) for t in times], chunk_size=500
         )
-        found = [record.log_time for record in mcap_records.Recording(path).records()]
+        found = [record.log_time for record in mcap_container.Recording(path).records()]
         assert found == sorted(times)
 
 
@@ -781,5 +784,5 @@ def test_intel(shared_data: Path) -> None:
 
 
 def test_the_module_names_its_error() -> None:
-    assert mcap_log.LogError is mcap_records.LogError
+    assert mcap_log.LogError is mcap_container.LogError
     assert issubclass(LogError, ValueError)

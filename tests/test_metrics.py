@@ -13,9 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from uwbslam_jax import metrics
+from uwbslam_jax import evaluation
 from uwbslam_jax.measurements import TruthMessage
-from uwbslam_jax.metrics import Truth
+from uwbslam_jax.evaluation import Truth
 from uwbslam_jax.result import BeaconEstimate, MapImage, Result
 
 EXACT = 1e-9  # rounding of a few float64 operations on numbers below 100
@@ -62,7 +62,7 @@ def test_rigid_fit_is_the_minimum() -> None:
     def cost(x: np.ndarray) -> float:
         return float(np.sum(w * np.sum((moved(a, x[0], x[1:]) - b) ** 2, axis=1)))
 
-    fit = metrics.rigid_fit(a, b, w)
+    fit = evaluation.rigid_fit(a, b, w)
     searched = min((minimize(cost, [angle, 0, 0]) for angle in (-2, 0, 2)), key=lambda found: found.fun)
     # The search stops where its numerical gradient does: about 1e-6 from the minimum.
     assert cost(np.array([fit.angle, *fit.translation])) <= searched.fun + EXACT
@@ -72,13 +72,13 @@ def test_rigid_fit_is_the_minimum() -> None:
 @given(st.floats(-3, 3), st.floats(-50, 50), st.floats(-50, 50), st.integers(0, 99))
 def test_rigid_fit_recovers_a_known_motion(angle: float, x: float, y: float, seed: int) -> None:
     points = np.random.default_rng(seed).normal(size=(5, 2))
-    fit = metrics.rigid_fit(points, moved(points, angle, np.array([x, y])))
+    fit = evaluation.rigid_fit(points, moved(points, angle, np.array([x, y])))
     np.testing.assert_allclose([fit.angle, *fit.translation], [angle, x, y], atol=EXACT)
 
 
 def test_rigid_fit_never_reflects() -> None:
     points = np.random.default_rng(2).normal(size=(20, 2))
-    fit = metrics.rigid_fit(points, points * [1, -1])
+    fit = evaluation.rigid_fit(points, points * [1, -1])
     assert np.linalg.det(fit.rotation) == pytest.approx(1)
     assert np.abs(fit.points(points) - points * [1, -1]).max() > 0.5
 
@@ -87,8 +87,8 @@ def test_a_weight_counts_like_a_repeated_point() -> None:
     rng = np.random.default_rng(3)
     a, b = rng.normal(size=(6, 2)), rng.normal(size=(6, 2))
     counts = np.array([1, 2, 3, 1, 5, 1])
-    weighted = metrics.rigid_fit(a, b, counts.astype(float))
-    repeated = metrics.rigid_fit(np.repeat(a, counts, 0), np.repeat(b, counts, 0))
+    weighted = evaluation.rigid_fit(a, b, counts.astype(float))
+    repeated = evaluation.rigid_fit(np.repeat(a, counts, 0), np.repeat(b, counts, 0))
     np.testing.assert_allclose(weighted.rotation, repeated.rotation, atol=EXACT)
     np.testing.assert_allclose(weighted.translation, repeated.translation, atol=EXACT)
 
@@ -97,7 +97,7 @@ def test_a_perfect_run_in_another_frame_has_no_error() -> None:
     truth, stamps, _, _ = scene(4)
     shift = np.array([3.0, -7.0])
     beacons = {node: moved(xy[None], 2.0, shift)[0] for node, xy in truth.beacon_positions().items()}
-    figures = metrics.evaluate(stamps, moved(truth.poses_at(stamps), 2.0, shift), beacons, truth)
+    figures = evaluation.evaluate(stamps, moved(truth.poses_at(stamps), 2.0, shift), beacons, truth)
     assert figures.pop("beacons_missing") == []
     assert figures.pop("covered") == pytest.approx((stamps[-1] - stamps[0]) / (89.9 * SECOND))
     assert figures == pytest.approx(dict.fromkeys(figures, 0.0), abs=1e-6)
@@ -107,7 +107,7 @@ def test_a_mirrored_run_fails() -> None:
     truth, stamps, _, _ = scene(5)
     mirrored = truth.poses_at(stamps) * [1, -1, -1]
     beacons = {node: xy * [1, -1] for node, xy in truth.beacon_positions().items()}
-    figures = metrics.evaluate(stamps, mirrored, beacons, truth)
+    figures = evaluation.evaluate(stamps, mirrored, beacons, truth)
     assert figures["robot_rmse_m"] > 0.3
     assert figures["beacon_max_m"] > 1.0
 
@@ -116,7 +116,7 @@ def test_known_errors_come_out() -> None:
     """Beacons exact and far heavier than one pose: its error stands alone."""
     truth, _, _, _ = scene(6, count=2)
     poses = truth.robot + np.array([[0.0, 0.0, 0.0], [1e-4, 0.0, np.deg2rad(3)]])
-    figures = metrics.evaluate(truth.stamps, poses, truth.beacon_positions(), truth)
+    figures = evaluation.evaluate(truth.stamps, poses, truth.beacon_positions(), truth)
     assert figures["robot_max_m"] == pytest.approx(1e-4, rel=0.1)
     assert figures["heading_deg_median"] == pytest.approx(1.5, abs=0.01)
     assert figures["heading_deg_p95"] == pytest.approx(0.95 * 3, abs=0.01)
@@ -137,7 +137,7 @@ def test_agrees_with_the_scorer(tmp_path: Path, seed: int, with_beacons: bool) -
     spec.loader.exec_module(scorer)
     truth, stamps, poses, beacons = scene(seed)
     beacons = beacons if with_beacons else {}
-    figures = metrics.evaluate(stamps, poses, beacons, truth)
+    figures = evaluation.evaluate(stamps, poses, beacons, truth)
 
     half = poses[:, 2] / 2
     zero = np.zeros(len(poses))
@@ -162,20 +162,20 @@ def test_agrees_with_the_scorer(tmp_path: Path, seed: int, with_beacons: bool) -
     assert figures.pop("beacons_missing") == want["beacons_missing"]
     theirs = {name: want[name.removesuffix("_m")] for name in figures}
     assert figures == pytest.approx(theirs, abs=EXACT, nan_ok=True)
-    loaded = metrics.evaluate(stamps, poses, beacons, Truth.load(tmp_path / "truth.npz"))
+    loaded = evaluation.evaluate(stamps, poses, beacons, Truth.load(tmp_path / "truth.npz"))
     assert {name: loaded[name] for name in figures} == pytest.approx(figures, abs=EXACT, nan_ok=True)
 
 
 def test_nothing_to_compare_is_nan_and_not_an_error() -> None:
     truth, stamps, poses, beacons = scene(7)
-    undecided = metrics.evaluate(stamps, np.full_like(poses, np.nan), {}, truth)
+    undecided = evaluation.evaluate(stamps, np.full_like(poses, np.nan), {}, truth)
     assert undecided["covered"] == 0.0
     assert np.isnan(undecided["robot_rmse_m"])
     assert undecided["beacons_missing"] == [7, 8, 9, 10]
-    assert np.isnan(metrics.evaluate(stamps, poses, {}, truth)["beacon_mean_m"])
+    assert np.isnan(evaluation.evaluate(stamps, poses, {}, truth)["beacon_mean_m"])
     late = poses.copy()
     late[:100] = np.nan
-    figures = metrics.evaluate(stamps, late, {**beacons, 99: np.zeros(2)}, truth)
+    figures = evaluation.evaluate(stamps, late, {**beacons, 99: np.zeros(2)}, truth)
     assert figures["covered"] < 0.95
     assert figures["robot_rmse_m"] == pytest.approx(0.14, abs=0.03)  # sqrt(2) * 0.1 m of noise
 
@@ -202,7 +202,7 @@ def test_truth_file_of_the_recorded_building(shared_data: Path) -> None:
     truth = Truth.load(shared_data / "intel" / "intel.truth.npz")
     assert len(truth.stamps) == 2671
     assert sorted(truth.beacons) == [1, 2, 3, 4, 5, 6]
-    assert metrics.travelled(truth.robot)[-1] == pytest.approx(394, abs=2)
+    assert evaluation.travelled(truth.robot)[-1] == pytest.approx(394, abs=2)
 
 
 def test_a_wrong_truth_file_says_what_is_missing(tmp_path: Path) -> None:
@@ -217,15 +217,15 @@ def test_a_wrong_truth_file_says_what_is_missing(tmp_path: Path) -> None:
 
 def test_relative_error_of_a_scaled_and_a_turning_track() -> None:
     true = np.column_stack([np.arange(101) * 0.1, np.zeros(101), np.zeros(101)])
-    along = metrics.travelled(true)
-    scaled = metrics.relative_pose_error(moved(true * [1.02, 1, 1], 1.0, np.ones(2)), true, along, 1.0 - 1e-9)
+    along = evaluation.travelled(true)
+    scaled = evaluation.relative_pose_error(moved(true * [1.02, 1, 1], 1.0, np.ones(2)), true, along, 1.0 - 1e-9)
     np.testing.assert_allclose(scaled, np.tile([0.02, 0.0], (91, 1)), atol=EXACT)  # 2 % of a metre, whatever the frame
     drifting = true.copy()
     drifting[:, 2] = 0.01 * np.arange(101)
     seconds = np.arange(101.0)
-    turned = metrics.relative_pose_error(drifting, true, seconds, 5.0)
+    turned = evaluation.relative_pose_error(drifting, true, seconds, 5.0)
     np.testing.assert_allclose(turned[:, 1], 0.05, atol=EXACT)
-    assert metrics.relative_pose_error(true, true, seconds, 1000.0).shape == (0, 2)
+    assert evaluation.relative_pose_error(true, true, seconds, 1000.0).shape == (0, 2)
 
 
 def test_nees_of_honest_and_of_overconfident_covariances() -> None:
@@ -233,13 +233,13 @@ def test_nees_of_honest_and_of_overconfident_covariances() -> None:
     root = rng.normal(size=(20_000, 3, 3))
     covs = root @ root.transpose(0, 2, 1) + 0.1 * np.eye(3)
     errors = np.einsum("nij,nj->ni", np.linalg.cholesky(covs), rng.normal(size=(20_000, 3)))
-    honest = metrics.nees(errors, covs)
+    honest = evaluation.nees(errors, covs)
     # A chi-square of 3 has variance 6: the mean of 20 000 is good to 0.017, so 0.1 is six sigma.
     assert honest.mean == pytest.approx(3, abs=0.1)
-    assert metrics.nees(errors, covs / 4).ratio == pytest.approx(4 * honest.ratio)
+    assert evaluation.nees(errors, covs / 4).ratio == pytest.approx(4 * honest.ratio)
     errors[5] = np.nan
-    assert metrics.nees(errors, covs).count == 19_999
-    assert np.isnan(metrics.nees(errors[:0], covs[:0]).mean)
+    assert evaluation.nees(errors, covs).count == 19_999
+    assert np.isnan(evaluation.nees(errors[:0], covs[:0]).mean)
 
 
 def consistent_run(seed: int, *, frame_error: float = 0.0) -> tuple[Result, Truth]:
@@ -270,10 +270,10 @@ def consistent_run(seed: int, *, frame_error: float = 0.0) -> tuple[Result, Trut
 
 
 def test_consistency_is_judged_in_the_frame_of_the_true_beacons() -> None:
-    figures = metrics.consistency(*consistent_run(9))
+    figures = evaluation.consistency(*consistent_run(9))
     assert figures["pose_nees_ratio"] == pytest.approx(1, abs=0.08)  # 2000 poses: four sigma of the mean
     assert figures["beacon_nees_ratio"] == pytest.approx(1, abs=0.6)  # 101 numbers: four sigma
-    wrong = metrics.consistency(*consistent_run(9, frame_error=0.2))
+    wrong = evaluation.consistency(*consistent_run(9, frame_error=0.2))
     assert wrong["pose_nees_ratio"] > 10  # a fit over robot and beacons would have turned this away
     assert wrong["beacon_nees_ratio"] > 10
 
@@ -282,7 +282,7 @@ def test_consistency_of_a_run_without_its_frame_in_the_truth_is_nan() -> None:
     result, truth = consistent_run(10)
     for frame in (None, [3, 99], [3, 3]):
         told = dataclasses.replace(result, summary={**result.summary, "frame_beacons": frame})
-        assert all(np.isnan(v) for v in metrics.consistency(told, truth).values())
+        assert all(np.isnan(v) for v in evaluation.consistency(told, truth).values())
 
 
 def test_a_frame_whose_beacons_move_stays_where_it_was_decided() -> None:
@@ -291,5 +291,5 @@ def test_a_frame_whose_beacons_move_stays_where_it_was_decided() -> None:
         2: np.array([[0.0, 1.0, 5.0], [1.0 * SECOND, 1.0, 6.0]]),
     }
     truth = Truth(np.array([0]), np.zeros((1, 3)), history)
-    frame = metrics.published_frame(truth, 1, 2, 5 * SECOND)
+    frame = evaluation.published_frame(truth, 1, 2, 5 * SECOND)
     np.testing.assert_allclose(frame.points(np.array([[0.0, 0.0], [4.0, 0.0]])), [[1, 2], [1, 6]], atol=EXACT)

@@ -11,14 +11,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from uwbslam_jax import layout, motion
-from uwbslam_jax.config import Params, Settings, UwbSettings, make_params
-from uwbslam_jax.ekf import Gaussian
-from uwbslam_jax.layout import Nodes
+from uwbslam_jax.estimator import state_vector
+from uwbslam_jax.estimator import motion
+from uwbslam_jax.settings import Params, Settings, UwbSettings, make_params
+from uwbslam_jax.numerics.gaussian import Gaussian
+from uwbslam_jax.estimator.state_vector import Nodes
 from uwbslam_jax.measurements import Odometry
 
 NODES = 3
-SIZE = layout.state_size(NODES)
+SIZE = state_vector.state_size(NODES)
 NONE = Odometry(jnp.zeros(3), jnp.array(False))
 RESTING = jnp.zeros(NODES, bool)
 CARRIED = jnp.array([False, True, False])
@@ -36,11 +37,11 @@ def state(velocity=(0.0, 0.0), heading=0.0, yaw_rate=0.0, map_error=(0.0, 0.0, 0
     positions = jnp.array([[1.0, 2.0], [5.0, 0.0], [-3.0, 4.0]])
     velocities = jnp.array([velocity, beacon_velocity, beacon_velocity])
     nodes = Nodes(positions, velocities, jnp.array(heading), jnp.array(yaw_rate), jnp.array(map_error))
-    return layout.pack(nodes)
+    return state_vector.pack(nodes)
 
 
 def driven(dt: float, odometry: Odometry = NONE, moving=RESTING, **start) -> Nodes:
-    return layout.unpack(transition(state(**start), jnp.array(dt), odometry, moving))
+    return state_vector.unpack(transition(state(**start), jnp.array(dt), odometry, moving))
 
 
 def odometry(x: float, y: float, turn: float) -> Odometry:
@@ -49,13 +50,13 @@ def odometry(x: float, y: float, turn: float) -> Odometry:
 
 def test_layout_packs_and_unpacks_the_same_entries():
     vector = jnp.arange(SIZE, dtype=jnp.float32)
-    np.testing.assert_array_equal(layout.pack(layout.unpack(vector)), vector)
-    assert layout.node_count(SIZE) == NODES
-    s = layout.unpack(vector)
-    np.testing.assert_array_equal(vector[jnp.array(layout.pose_indices(NODES))], [*s.positions[0], s.heading])
-    np.testing.assert_array_equal(vector[jnp.array(layout.map_error_indices(NODES))], s.map_error)
-    want = layout.robot_pose(vector) + s.map_error
-    np.testing.assert_array_equal(layout.matched_pose_jacobian(NODES) @ vector, want)
+    np.testing.assert_array_equal(state_vector.pack(state_vector.unpack(vector)), vector)
+    assert state_vector.node_count(SIZE) == NODES
+    s = state_vector.unpack(vector)
+    np.testing.assert_array_equal(vector[jnp.array(state_vector.pose_indices(NODES))], [*s.positions[0], s.heading])
+    np.testing.assert_array_equal(vector[jnp.array(state_vector.map_error_indices(NODES))], s.map_error)
+    want = state_vector.robot_pose(vector) + s.map_error
+    np.testing.assert_array_equal(state_vector.matched_pose_jacobian(NODES) @ vector, want)
 
 
 def test_constant_velocity_over_a_short_time():
@@ -177,7 +178,7 @@ def test_motion_that_no_velocity_explains_widens_the_pose_and_nothing_else(param
     calm = predict(belief, params, jnp.array(0.1), NONE, RESTING, jnp.zeros(2))
     restless = predict(belief, params, jnp.array(0.1), NONE, RESTING, jnp.array([0.04, 0.01]))
     want = np.zeros(SIZE)
-    want[np.array(layout.pose_indices(NODES))] = 0.04, 0.04, 0.01
+    want[np.array(state_vector.pose_indices(NODES))] = 0.04, 0.04, 0.01
     np.testing.assert_allclose(restless.cov - calm.cov, np.diag(want), atol=1e-8)  # float32
     np.testing.assert_array_equal(restless.mean, calm.mean)
     # an increment of the odometry is the motion: nothing is unexplained
@@ -199,7 +200,7 @@ def test_a_robot_not_seen_for_long_is_no_less_certain_than_a_robot_can_be(params
 
 def test_the_map_of_a_robot_at_rest_errs_as_before_however_long_it_stands(params):
     """It changes where something is drawn or other ground is seen (trust), not with time."""
-    rows = np.array(layout.map_error_indices(NODES))
+    rows = np.array(state_vector.map_error_indices(NODES))
     belief = Gaussian(state(map_error=(0.3, 0.2, 0.01)), 1e-4 * jnp.eye(SIZE))
     still = odometry(0.0, 0.0, 0.0)
     after = predict(belief, params, jnp.array(10.0), still, RESTING, UNREST)

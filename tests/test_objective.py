@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from derivatives import assert_gradient, double
 
-from uwbslam_jax import grid as occupancy
-from uwbslam_jax import matching, objective
-from uwbslam_jax.geometry import transform_points
+from uwbslam_jax.mapping import grid as occupancy
+from uwbslam_jax.estimator import matching
+from uwbslam_jax.estimator import lidar_objective
+from uwbslam_jax.numerics.se2 import transform_points
 
 CELLS, SIZE, BEAMS = 40, 0.2, 60
 
@@ -39,7 +40,7 @@ def residuals(pose, level, origin, points, valid):
 
 @jax.jit
 def lidar(pose, level, origin, points, valid):
-    return objective.lidar_residual(pose, level, origin, SIZE, points, valid)
+    return lidar_objective.lidar_residual(pose, level, origin, SIZE, points, valid)
 
 
 residual_jacobian, lidar_jacobian = jax.jit(jax.jacfwd(residuals)), jax.jit(jax.jacfwd(lidar))
@@ -51,7 +52,7 @@ def test_gram_matrix_holds_the_papers_sums(case):
     r = residuals(pose, *rest)
     J = residual_jacobian(pose, *rest)
     level, origin, points, valid = rest
-    G = jax.jit(objective.lidar_gram)(pose, level, origin, SIZE, points, valid)
+    G = jax.jit(lidar_objective.lidar_gram)(pose, level, origin, SIZE, points, valid)
     # H^(LiD), -M^(LiD) and twice the LiDAR term; float64
     np.testing.assert_allclose(G[:3, :3], J.T @ J, rtol=1e-10)
     np.testing.assert_allclose(G[:3, 3], J.T @ r, rtol=1e-10, atol=1e-10)
@@ -91,7 +92,7 @@ def test_gradient_of_the_objective_with_prior_agrees_with_finite_differences(cas
     def J(at):
         pose, level, points, mean, root, sigma_l = at
         beams = lidar(pose, level, origin, points, valid) / sigma_l
-        prior = objective.prior_residual(pose, mean, root)
+        prior = lidar_objective.prior_residual(pose, mean, root)
         return 0.5 * (beams @ beams + prior @ prior)
 
     # the jitter of the root on terms of a few hundred that cancel
@@ -104,7 +105,7 @@ def test_prior_residual_whitens():
     A = rng.normal(size=(3, 3))
     P, delta, mean = A @ A.T + np.eye(3), rng.normal(size=3), rng.normal(size=3)
     root = np.linalg.cholesky(np.linalg.inv(P)).T
-    r = objective.prior_residual(*map(jnp.asarray, (delta, mean, root)))
+    r = lidar_objective.prior_residual(*map(jnp.asarray, (delta, mean, root)))
     np.testing.assert_allclose(r @ r, (delta - mean) @ np.linalg.solve(P, delta - mean), rtol=1e-10)
 
 

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uwbslam_jax.outputs import RunError, read_run, read_trajectory, trinary, write_result, write_trajectory
+from uwbslam_jax.files.run_folder import RunError, read_run, read_trajectory, trinary, write_result, write_trajectory
 from uwbslam_jax.result import BeaconEstimate, MapImage, Result
 
 T0 = 1_700_000_000_123_456_789  # ns; no float64 holds it

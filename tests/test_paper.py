@@ -9,15 +9,18 @@ import pytest
 import small_room as room
 from derivatives import assert_gradient, double
 
-from uwbslam_jax import grid as occupancy
-from uwbslam_jax import layout, matching, paper, ranging
-from uwbslam_jax.config import Settings, UwbSettings, make_params
-from uwbslam_jax.ekf import Gaussian
-from uwbslam_jax.geometry import rotation, transform_points
-from uwbslam_jax.layout import Nodes
+from uwbslam_jax.mapping import grid as occupancy
+from uwbslam_jax.estimator import state_vector
+from uwbslam_jax.estimator import matching
+from uwbslam_jax.estimator import paper
+from uwbslam_jax.estimator import ranging
+from uwbslam_jax.settings import Settings, UwbSettings, make_params
+from uwbslam_jax.numerics.gaussian import Gaussian
+from uwbslam_jax.numerics.se2 import rotation, transform_points
+from uwbslam_jax.estimator.state_vector import Nodes
 
 NODES, GAMMA = 4, 20.0
-SIZE = layout.state_size(NODES)
+SIZE = state_vector.state_size(NODES)
 """gamma makes ranges and beams weigh alike in the robot's position. A node that only ranges see does not tell the
 printed form from the mended one: there both signs cancel."""
 POSITIONS = np.array([[0.11, -0.07], [0.0, 0.0], [5.0, 0.0], [1.0, 4.0]])
@@ -26,7 +29,7 @@ FRAME = jnp.array([1, 2], jnp.int32)
 
 
 def vector(positions=POSITIONS, heading=0.3) -> jax.Array:
-    return layout.pack(
+    return state_vector.pack(
         Nodes(jnp.asarray(positions), jnp.asarray(VELOCITIES), jnp.array(heading), jnp.array(0.1), jnp.zeros(3))
     )
 
@@ -141,7 +144,7 @@ def test_correction_turns_the_velocity_and_keeps_the_speed(turn):
     """Erratum 2: the printed form adds |v| (cos, sin), which doubles the speed of a robot that needs no correction."""
     delta = jnp.zeros(2 * NODES + 1).at[-1].set(turn).at[0].set(0.02)
     belief = Gaussian(vector(), jnp.eye(SIZE))
-    s = layout.unpack(paper.correct(belief, delta).mean)
+    s = state_vector.unpack(paper.correct(belief, delta).mean)
     v, before = np.asarray(s.velocities[0]), VELOCITIES[0]
     np.testing.assert_allclose(np.hypot(*v), np.hypot(*before), rtol=1e-6)
     np.testing.assert_allclose(v, np.asarray(rotation(jnp.array(turn))) @ before, atol=1e-6)
@@ -161,7 +164,7 @@ def test_pinned_frame_carries_the_covariance_by_the_jacobian_of_the_gauge_map():
     root[: 4 * NODES + 1, :] = 0.01 * rng.normal(size=(4 * NODES + 1, SIZE))  # small: the map is linear over it
     belief = Gaussian(vector(elsewhere), jnp.asarray(root @ root.T))
     pinned = paper.pin_frame(belief, FRAME)
-    s = layout.unpack(pinned.mean)
+    s = state_vector.unpack(pinned.mean)
     np.testing.assert_allclose(s.positions[1:3], [[0, 0], [5, 0]], atol=1e-9)
     np.testing.assert_allclose(s.positions, POSITIONS, atol=1e-9)
     # velocities turn with the same R; heading by its angle
@@ -181,12 +184,12 @@ def test_pinned_frame_carries_the_covariance_by_the_jacobian_of_the_gauge_map():
 @pytest.mark.usefixtures("x64")
 def test_heading_is_the_direction_of_motion_and_stays_at_rest():
     moving = paper.heading_from_velocity(Gaussian(vector(), jnp.eye(SIZE)))
-    np.testing.assert_allclose(layout.unpack(moving.mean).heading, np.arctan2(0.5, 0.6), rtol=1e-9)
-    s = layout.unpack(vector())
-    still = layout.pack(s._replace(velocities=jnp.zeros((NODES, 2))))
+    np.testing.assert_allclose(state_vector.unpack(moving.mean).heading, np.arctan2(0.5, 0.6), rtol=1e-9)
+    s = state_vector.unpack(vector())
+    still = state_vector.pack(s._replace(velocities=jnp.zeros((NODES, 2))))
     resting = paper.heading_from_velocity(Gaussian(still, jnp.eye(SIZE)))
-    assert float(layout.unpack(resting.mean).heading) == float(s.heading)
-    slope = jax.grad(lambda x: layout.unpack(paper.heading_from_velocity(Gaussian(x, jnp.eye(SIZE))).mean).heading)
+    assert float(state_vector.unpack(resting.mean).heading) == float(s.heading)
+    slope = jax.grad(lambda x: state_vector.unpack(paper.heading_from_velocity(Gaussian(x, jnp.eye(SIZE))).mean).heading)
     assert np.isfinite(slope(still)).all()
 
 

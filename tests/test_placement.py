@@ -10,8 +10,9 @@ import pytest
 import start_of_run
 from scipy.optimize import least_squares
 
-from uwbslam_jax import hypotheses, multilateration
-from uwbslam_jax.placement import CALIBRATED_M, Problem
+from uwbslam_jax.startup import hypotheses
+from uwbslam_jax.numerics import multilateration
+from uwbslam_jax.startup.placement import CALIBRATED_M, Problem
 
 
 def problem(poses=None, **options) -> Problem:

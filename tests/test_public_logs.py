@@ -11,10 +11,10 @@ from test_without_lidar import SCALE, driven
 from benchmarks import batch_solution
 from benchmarks.public_logs import DRIVEN, P2P_BAR_M, p2p
 from benchmarks.without_lidar import orthogonal_rms, rest_rows, tables
-from uwbslam_jax import relative
+from uwbslam_jax.startup import static_geometry
 from uwbslam_jax.measurements import OdometryMessage, RangeMessage, TruthMessage
-from uwbslam_jax.metrics import Truth, absolute_trajectory_error
-from uwbslam_jax.relative import Links
+from uwbslam_jax.evaluation import Truth, absolute_trajectory_error
+from uwbslam_jax.startup.static_geometry import Links
 
 
 def truth_of(messages) -> Truth:
@@ -44,7 +44,7 @@ def test_nodes_at_rest_are_placed_within_the_bar(shared_data: Path) -> None:
             in_sight = not m.receive_power - m.first_path_power > log.settings.uwb.nlos_gap_db
             delay = sum(log.settings.uwb.bias[str(node)] for node in (m.source, m.target))
             links.add(m.source, m.target, m.range - delay, in_sight=in_sight)
-    found = relative.solve(links.averages())
+    found = static_geometry.solve(links.averages())
     assert found.links == 28
     assert found.gross > 16
     placed = dict(zip(found.nodes, found.positions, strict=True))

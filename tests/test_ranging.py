@@ -14,14 +14,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import norm
 
-from uwbslam_jax import layout, motion, ranging
-from uwbslam_jax.config import Params, Settings, UwbSettings, make_params
-from uwbslam_jax.ekf import Gaussian
-from uwbslam_jax.layout import Nodes
+from uwbslam_jax.estimator import state_vector
+from uwbslam_jax.estimator import motion
+from uwbslam_jax.estimator import ranging
+from uwbslam_jax.settings import Params, Settings, UwbSettings, make_params
+from uwbslam_jax.numerics.gaussian import Gaussian
+from uwbslam_jax.estimator.state_vector import Nodes
 from uwbslam_jax.measurements import Odometry, Ranges
 
 NODES = 4
-SIZE = layout.state_size(NODES)
+SIZE = state_vector.state_size(NODES)
 PAIRS = room.all_pairs(NODES)
 QUIET = ranging.quiet(NODES)
 predicted_ranges = jax.jit(ranging.predicted_ranges)
@@ -55,7 +57,7 @@ def vector(positions=POSITIONS) -> jax.Array:
     nodes = Nodes(
         jnp.asarray(positions, float), jnp.asarray(VELOCITIES), jnp.array(HEADING), jnp.array(YAW_RATE), jnp.zeros(3)
     )
-    return layout.pack(nodes)
+    return state_vector.pack(nodes)
 
 
 def flat_params(**changed) -> Params:

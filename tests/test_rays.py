@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from uwbslam_jax import rays, worlds
+from uwbslam_jax.sim import rays
+from uwbslam_jax.sim import worlds
 
 
 def test_cast_in_a_square_room_is_analytic() -> None:

@@ -7,8 +7,8 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from uwbslam_jax import relative
-from uwbslam_jax.relative import Link, Links, average, solve
+from uwbslam_jax.startup import static_geometry
+from uwbslam_jax.startup.static_geometry import Link, Links, average, solve
 
 NODES = {
     3: (0.0, 0.0),
@@ -28,7 +28,7 @@ def true_links(nodes: dict[int, tuple[float, float]], without: set[tuple[int, in
     return {(a, b): Link(float(np.hypot(*np.subtract(nodes[a], nodes[b]))), 10, 0) for a, b in pairs}
 
 
-def rms_after_fit(found: relative.Relative, nodes: dict[int, tuple[float, float]]) -> float:
+def rms_after_fit(found: static_geometry.Relative, nodes: dict[int, tuple[float, float]]) -> float:
     """RMS distance to the truth after the best orthogonal motion, reflection allowed [m]."""
     A, B = found.positions, np.array([nodes[node] for node in found.nodes])
     A, B = A - A.mean(0), B - B.mean(0)

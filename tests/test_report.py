@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from uwbslam_jax.report import write_report
+from uwbslam_jax.web.report import write_report
 from uwbslam_jax.result import BeaconEstimate, MapImage, Result
 
 START = 1_700_000_000_000_000_000

@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks.suite import ROWS
 from benchmarks.trials import measure
-from uwbslam_jax.simulate import scenario
+from uwbslam_jax.sim.simulate import scenario
 
 BEAMS = 361
 """One size for all scenarios: the step is compiled once."""

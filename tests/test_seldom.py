@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from uwbslam_jax.seldom import seldom
+from uwbslam_jax.estimator.batched_cond import seldom
 
 WANTED = np.array([False, True, False, True, False])
 OLD = np.arange(5, dtype=np.float32)

@@ -11,10 +11,11 @@ import pytest
 import small_room as room
 from derivatives import assert_reverse, double, value_and_gradient
 
-from uwbslam_jax import grid as occupancy
-from uwbslam_jax import layout, slam
-from uwbslam_jax.config import Config, Params, Settings, UwbSettings, make_params
-from uwbslam_jax.layout import Nodes
+from uwbslam_jax.mapping import grid as occupancy
+from uwbslam_jax.estimator import state_vector
+from uwbslam_jax.estimator import step
+from uwbslam_jax.settings import Config, Params, Settings, UwbSettings, make_params
+from uwbslam_jax.estimator.state_vector import Nodes
 from uwbslam_jax.measurements import Odometry, Scan
 
 BEAMS = 60
@@ -38,11 +39,11 @@ BEACONS = np.array([[-3.5, -2.5], [4.0, -2.0], [1.0, 3.0]])
 PAIRS = room.all_pairs(4)
 POSE = np.array([0.33, -0.41, 0.6])
 
-step = jax.jit(slam.step, static_argnums=0)
+step = jax.jit(step.step, static_argnums=0)
 
 
 def sweep_of(scan: Scan):
-    return slam.undo_motion(jax.tree.map(jnp.asarray, scan), jnp.zeros(3), jnp.zeros(2), jnp.zeros(()))
+    return step.undo_motion(jax.tree.map(jnp.asarray, scan), jnp.zeros(3), jnp.zeros(2), jnp.zeros(()))
 
 
 @pytest.fixture(scope="module")
@@ -55,21 +56,21 @@ def room_map():
     return grid
 
 
-def knowing(grid, pose=POSE, velocity=(0.0, 0.0), yaw_rate=0.0, seed=0) -> slam.State:
+def knowing(grid, pose=POSE, velocity=(0.0, 0.0), yaw_rate=0.0, seed=0) -> step.State:
     """A state in the middle of a run: the room drawn, three beacons placed, the robot near a pose."""
-    state = slam.init(CONFIG)
+    state = step.init(CONFIG)
     positions = np.vstack([pose[:2], BEACONS])
     velocities = np.zeros((4, 2))
     velocities[0] = velocity
     nodes = Nodes(*(jnp.asarray(x, jnp.float32) for x in (positions, velocities, pose[2], yaw_rate, np.zeros(3))))
-    n = layout.state_size(4)
+    n = state_vector.state_size(4)
     std = np.full(n, 1e-3)
     std[:2], std[2:8], std[8:10], std[16:18], std[18:] = 0.05, 0.03, 0.2, (0.05, 0.3), 0.02
     rng = np.random.default_rng(seed)
     correlation = 0.9 * np.eye(n) + 0.1 * np.corrcoef(rng.normal(size=(n, 2 * n)))
     cov = jnp.asarray(correlation * np.outer(std, std), jnp.float32)
     return state._replace(
-        belief=state.belief._replace(mean=layout.pack(nodes), cov=cov),
+        belief=state.belief._replace(mean=state_vector.pack(nodes), cov=cov),
         active=jnp.ones(4, bool),
         grid=grid,
         drawn_pose=jnp.asarray(pose, jnp.float32),
@@ -85,7 +86,7 @@ def measured(pose=POSE, dt=0.1, scan=True, noise=0.0, gap=np.nan, odometry=None,
 
 
 def test_first_step_starts_at_the_origin_and_draws_the_first_scan():
-    state, estimate = step(CONFIG, PARAMS, slam.init(CONFIG), measured())
+    state, estimate = step(CONFIG, PARAMS, step.init(CONFIG), measured())
     np.testing.assert_allclose(estimate.pose, 0.0, atol=1e-4)
     assert bool(estimate.drawn)
     assert int(state.scans_drawn) == 1
@@ -174,7 +175,7 @@ def test_many_float32_steps_keep_the_covariance_healthy(room_map):
     frame = jax.tree.map(jnp.asarray, measured())
 
     def one(state, _):
-        state, _ = slam.step(FLAT, PARAMS, state, frame)
+        state, _ = step.step(FLAT, PARAMS, state, frame)
         P = state.belief.cov
         scale = jnp.sqrt(jnp.diagonal(P))
         correlation = P / (scale[:, None] * scale[None, :])
@@ -185,7 +186,7 @@ def test_many_float32_steps_keep_the_covariance_healthy(room_map):
     # beacons at rest come to share the robot's error: nearly singular, never negative beyond rounding of n = 21
     assert float(smallest.min()) > -1e-5
     assert np.isfinite(state.belief.mean).all()
-    np.testing.assert_allclose(layout.robot_pose(state.belief.mean), POSE, atol=0.03)
+    np.testing.assert_allclose(state_vector.robot_pose(state.belief.mean), POSE, atol=0.03)
 
 
 def test_each_beam_is_placed_at_its_own_time():
@@ -201,7 +202,7 @@ def test_each_beam_is_placed_at_its_own_time():
         np.float32(dt),
     )
     as_jax = [jnp.asarray(x, jnp.float32) for x in (lidar, velocity, yaw_rate)]
-    sweep = slam.undo_motion(jax.tree.map(jnp.asarray, scan), *as_jax)
+    sweep = step.undo_motion(jax.tree.map(jnp.asarray, scan), *as_jax)
     for k in range(beams):
         t = k * dt
         a = lidar[2] - 1.0 + 0.05 * k
@@ -220,18 +221,18 @@ def test_the_whole_state_may_stand_anywhere(room_map):
     _, here = step(CONFIG, PARAMS, knowing(room_map), measured(truth))
     turn = np.array([[0.0, -1.0], [1.0, 0.0]])
     state = knowing(room_map)
-    s = layout.unpack(state.belief.mean)
+    s = state_vector.unpack(state.belief.mean)
     moved = s._replace(positions=s.positions @ turn.T.astype(np.float32), heading=s.heading + jnp.float32(np.pi / 2))
-    block = np.eye(layout.state_size(4))
+    block = np.eye(state_vector.state_size(4))
     block[:16, :16] = np.kron(np.eye(8), turn)
     block[18:20, 18:20] = turn
     block = block.astype(np.float32)
     cov = jnp.asarray(block @ np.asarray(state.belief.cov) @ block.T)
     grid = room_map._replace(levels=tuple(jnp.rot90(level, k=-1) for level in room_map.levels))
     state = state._replace(
-        belief=state.belief._replace(mean=layout.pack(moved), cov=cov),
+        belief=state.belief._replace(mean=state_vector.pack(moved), cov=cov),
         grid=grid,
-        drawn_pose=layout.robot_pose(layout.pack(moved)),
+        drawn_pose=state_vector.robot_pose(state_vector.pack(moved)),
     )
     _, there = step(CONFIG, PARAMS, state, measured(truth))
     want = np.append(turn @ np.asarray(here.pose[:2]), float(here.pose[2]) + np.pi / 2)
@@ -256,12 +257,12 @@ def test_gradient_of_a_whole_step_agrees_with_finite_differences(room_map):
     state = double(state._replace(map_spread=spread))
     params: Params = double(PARAMS)
     params = params._replace(height=jnp.array([0.5, 0.7, 0.3, 0.9]), bias=jnp.array([0.01, 0.02, 0.0, -0.01]))
-    weights = jnp.asarray(np.random.default_rng(0).normal(size=layout.state_size(4)))
+    weights = jnp.asarray(np.random.default_rng(0).normal(size=state_vector.state_size(4)))
 
     def value(at, frame):
         tunable, mean, root = at
         start = state._replace(belief=state.belief._replace(mean=mean, cov=root @ root.T))
-        after, estimate = slam.step(FLAT, params._replace(**tunable), start, frame)
+        after, estimate = step.step(FLAT, params._replace(**tunable), start, frame)
         spread = weights @ after.belief.cov @ weights
         decided = estimate.searched | estimate.poor
         total = weights @ after.belief.mean + spread + 0.1 * estimate.log_likelihood + estimate.score
@@ -290,7 +291,7 @@ def test_gradient_through_a_first_scan_that_is_drawn_is_finite():
     def value(at):
         tunable, mean = at
         start = state._replace(belief=state.belief._replace(mean=mean))
-        after, estimate = slam.step(FLAT, params._replace(**tunable), start, frame)
+        after, estimate = step.step(FLAT, params._replace(**tunable), start, frame)
         total = jnp.sum(after.belief.mean) + jnp.sum(after.grid.levels[0]) - estimate.log_likelihood
         return jnp.where(estimate.drawn, total, jnp.nan)  # it is drawn
 

@@ -6,9 +6,10 @@ from collections import deque
 
 import numpy as np
 
-from uwbslam_jax import smoothing, sparse_rows
-from uwbslam_jax.graph import Graph, relative
-from uwbslam_jax.range_means import RangeMeans
+from uwbslam_jax.backend import smoothing
+from uwbslam_jax.numerics import sparse_least_squares
+from uwbslam_jax.backend.graph import Graph, relative
+from uwbslam_jax.backend.range_means import RangeMeans
 
 BEACONS = {1: np.array([-3.0, 5.0]), 2: np.array([9.0, 6.0]), 3: np.array([8.0, -4.0]), 4: np.array([-2.0, -3.0])}
 SIGMA_N = 0.1
@@ -216,7 +217,7 @@ def stacked(fill, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def test_normal_equations_are_those_of_the_rows(monkeypatch) -> None:
     """Gathered block by block, with a few rows in each, they are J.T J, J.T r and r.r / 2 of all rows."""
-    monkeypatch.setattr(sparse_rows, "_BLOCK", 7)
+    monkeypatch.setattr(sparse_least_squares, "_BLOCK", 7)
     truth = loop(40)
     graph = make(truth)
     places = {(slot, 0): spot for slot, spot in BEACONS.items()}
@@ -225,7 +226,7 @@ def test_normal_equations_are_those_of_the_rows(monkeypatch) -> None:
     fill = problem._rows(x[:3] + 1e-5, 0.3, (30.0, 2.0))
     J, r = stacked(fill, x)
     rank = np.random.default_rng(6).permutation(len(x))
-    rows, cost = sparse_rows.Rows(rank), sparse_rows.Cost()
+    rows, cost = sparse_least_squares.Rows(rank), sparse_least_squares.Cost()
     fill(x, rows)
     fill(x, cost)
     A, b = rows.normal()
@@ -244,10 +245,10 @@ def test_unknowns_are_eliminated_in_an_order_that_keeps_the_factor_sparse() -> N
     assert sorted(problem.rank) == list(range(problem.size))
 
     def entries(rank: np.ndarray) -> tuple[int, int]:
-        rows = sparse_rows.Rows(rank)
+        rows = sparse_least_squares.Rows(rank)
         problem._rows(np.zeros(3), 0.3, (30.0, 2.0))(problem.start(graph.poses(), places), rows)
         A = rows.normal().A
-        return A.nnz // 2, sparse_rows._factor(A.T).L.nnz
+        return A.nnz // 2, sparse_least_squares._factor(A.T).L.nnz
 
     lower, factor = entries(problem.rank)
     assert factor < 1.5 * lower

@@ -10,16 +10,20 @@ import pytest
 import start_of_run
 from start_of_run import BEACONS, IDS, SETTINGS
 
-from uwbslam_jax import geometry, keyframes, layout, slam, startup
-from uwbslam_jax.config import make_config, make_params
-from uwbslam_jax.tiles import Tiles
+from uwbslam_jax.numerics import se2
+from uwbslam_jax.startup import keyframe_buffer
+from uwbslam_jax.estimator import state_vector
+from uwbslam_jax.estimator import step
+from uwbslam_jax.startup import decide
+from uwbslam_jax.settings import make_config, make_params
+from uwbslam_jax.mapping.tiled_map import Tiles
 
 TRUTH = np.array(list(BEACONS.values()))
 CONFIG, PARAMS = make_config(SETTINGS), make_params(SETTINGS)
 
 
-def solved(poses, **options) -> startup.Outcome:
-    return startup.solve(start_of_run.buffer(poses, **options), IDS)
+def solved(poses, **options) -> decide.Outcome:
+    return decide.solve(start_of_run.buffer(poses, **options), IDS)
 
 
 def test_at_rest_it_waits_for_motion():
@@ -28,8 +32,8 @@ def test_at_rest_it_waits_for_motion():
 
 
 def test_an_empty_buffer_waits_for_motion():
-    empty = startup.Buffer(np.zeros(2), np.zeros(4), np.zeros(4), 0.1)
-    assert startup.solve(empty, IDS).status == "waiting for motion"
+    empty = decide.Buffer(np.zeros(2), np.zeros(4), np.zeros(4), 0.1)
+    assert decide.solve(empty, IDS).status == "waiting for motion"
 
 
 def test_one_beacon_alone_makes_no_frame():
@@ -62,7 +66,7 @@ def test_after_a_turn_the_mirror_images_are_told_apart(seed, side):
 def test_published_frame_has_the_lowest_id_at_the_origin_and_the_farthest_beacon_on_x():
     outcome = solved(start_of_run.with_a_turn())
     # slot 3 is 9.9 m from slot 1 and 8.1 m from slot 2
-    assert startup.choose_frame(outcome.placement, {0: 0, 1: 30, 2: 12, 3: 7}) == (3, 1)
+    assert decide.choose_frame(outcome.placement, {0: 0, 1: 30, 2: 12, 3: 7}) == (3, 1)
 
 
 MOTION = [2 * CONFIG.nodes, 2 * CONFIG.nodes + 1, 4 * CONFIG.nodes + 1]
@@ -73,11 +77,11 @@ MOTION_COV = np.array([[0.04, 0.01, 0.002], [0.01, 0.01, -0.003], [0.002, -0.003
 def adopted_case():
     """A decided start, and a LiDAR-only state that has driven a little on from the last keyframe."""
     kept = start_of_run.buffer(start_of_run.with_a_turn())
-    outcome = startup.solve(kept, IDS)
-    state = slam.init(CONFIG)
+    outcome = decide.solve(kept, IDS)
+    state = step.init(CONFIG)
     pose = kept.keyframes[-1].pose + np.array([0.05, 0.1, 0.02])
-    s = layout.unpack(state.belief.mean)
-    mean = layout.pack(
+    s = state_vector.unpack(state.belief.mean)
+    mean = state_vector.pack(
         s._replace(
             positions=s.positions.at[0].set(jnp.asarray(pose[:2])),
             velocities=s.velocities.at[0].set(jnp.array([0.3, 0.7])),
@@ -89,8 +93,8 @@ def adopted_case():
     cov = np.array(state.belief.cov)
     cov[np.ix_(at, at)] = MOTION_COV
     state = state._replace(belief=state.belief._replace(mean=mean, cov=jnp.asarray(cov)))
-    frame_slots = startup.choose_frame(outcome.placement, IDS)
-    adopted = startup.adopt(CONFIG, PARAMS, state, Tiles(CONFIG.resolution), kept, outcome.placement, frame_slots)
+    frame_slots = decide.choose_frame(outcome.placement, IDS)
+    adopted = decide.adopt(CONFIG, PARAMS, state, Tiles(CONFIG.resolution), kept, outcome.placement, frame_slots)
     return outcome.placement, state, frame_slots, adopted, pose
 
 
@@ -110,9 +114,9 @@ def published(x: np.ndarray, onward: np.ndarray, frame: tuple[int, int]) -> np.n
 
 def test_adopted_state_is_the_start_in_the_published_frame():
     placement, state, frame, adopted, pose = adopted_case()
-    onward = startup.between(_last_key(), pose)
+    onward = decide.between(_last_key(), pose)
     want = published(np.concatenate([placement.poses[-1], placement.beacons.ravel()]), onward, frame)
-    s = layout.unpack(adopted.state.belief.mean)
+    s = state_vector.unpack(adopted.state.belief.mean)
     np.testing.assert_allclose(s.positions[0], want[:2], atol=1e-4)  # float32 of some metres
     np.testing.assert_allclose(np.exp(1j * float(s.heading)), np.exp(1j * want[2]), atol=1e-5)
     np.testing.assert_allclose(s.positions[1:], want[3:].reshape(-1, 2), atol=1e-5)
@@ -122,9 +126,9 @@ def test_adopted_state_is_the_start_in_the_published_frame():
     # the velocity turns with the frame: the same speed, the same angle against the heading
     v, before = np.asarray(s.velocities[0]), np.array([0.3, 0.7])
     np.testing.assert_allclose(np.hypot(*v), np.hypot(*before), rtol=1e-6)
-    turned = np.asarray(geometry.rotation(-s.heading) @ s.velocities[0])
-    np.testing.assert_allclose(turned, startup.rotation(-pose[2]) @ before, atol=1e-5)
-    assert float(s.yaw_rate) == float(layout.unpack(state.belief.mean).yaw_rate)
+    turned = np.asarray(se2.rotation(-s.heading) @ s.velocities[0])
+    np.testing.assert_allclose(turned, decide.rotation(-pose[2]) @ before, atol=1e-5)
+    assert float(s.yaw_rate) == float(state_vector.unpack(state.belief.mean).yaw_rate)
 
 
 def _last_key() -> np.ndarray:
@@ -136,22 +140,22 @@ def test_adopted_covariance_is_that_of_samples_put_through_the_change_of_frame()
     n = placement.poses.size
     x = np.concatenate([placement.poses[-1], placement.beacons.ravel()])
     cov = placement.cov[n - 3 :, n - 3 :]
-    onward = startup.between(_last_key(), pose)
+    onward = decide.between(_last_key(), pose)
     # a tenth of the spread, so that the map is linear over the samples
     samples = np.random.default_rng(0).multivariate_normal(x, cov / 100, 4000)
     mapped = np.array([published(sample, onward, frame) for sample in samples])
     want = 100 * np.cov(mapped.T)
     P = np.asarray(adopted.state.belief.cov)
     nodes = CONFIG.nodes
-    at = [*layout.pose_indices(nodes), *range(2, 2 * nodes)]
+    at = [*state_vector.pose_indices(nodes), *range(2, 2 * nodes)]
     # a sample covariance of 4000 is right to 2.2 % of each pair's spread; four times that
     spread = np.sqrt(np.diag(want))
     np.testing.assert_allclose(P[np.ix_(at, at)], want, atol=0.09 * np.outer(spread, spread).max())
     for known in (2 * frame[0], 2 * frame[0] + 1, 2 * frame[1] + 1):
         assert P[known, known] < 1e-10  # the frame's own coordinates
-    error = np.array(layout.map_error_indices(nodes))
-    robot = np.array(layout.pose_indices(nodes))
-    C = np.asarray(layout.matched_pose_jacobian(nodes))
+    error = np.array(state_vector.map_error_indices(nodes))
+    robot = np.array(state_vector.pose_indices(nodes))
+    C = np.asarray(state_vector.matched_pose_jacobian(nodes))
     # what a match reports is known: the map was drawn at the estimated poses
     np.testing.assert_allclose(C @ P @ C.T, 0.0, atol=1e-8)
     np.testing.assert_allclose(P[np.ix_(error, error)], P[np.ix_(robot, robot)], atol=1e-10)
@@ -160,9 +164,9 @@ def test_adopted_covariance_is_that_of_samples_put_through_the_change_of_frame()
 
 def test_covariance_of_the_velocity_turns_with_the_frame():
     _, _, _, adopted, pose = adopted_case()
-    turn = float(layout.unpack(adopted.state.belief.mean).heading) - pose[2]
+    turn = float(state_vector.unpack(adopted.state.belief.mean).heading) - pose[2]
     J = np.eye(3)
-    J[:2, :2] = startup.rotation(turn)
+    J[:2, :2] = decide.rotation(turn)
     P = np.asarray(adopted.state.belief.cov)
     np.testing.assert_allclose(P[np.ix_(MOTION, MOTION)], J @ MOTION_COV @ J.T, atol=1e-6)  # float32
 
@@ -174,7 +178,7 @@ def test_earlier_poses_are_republished_with_the_keyframes_around_them():
     # a pose between two keyframes keeps its place relative to both, the nearer one counting more
     later = (track[3] + np.array([0.1, 0.02, 0.05]))[None]
     quarter = adopted.anchors[3:4] + (adopted.anchors[4] - adopted.anchors[3]) // 4
-    ends = [startup.compose(adopted.after[k], startup.between(track[k], later)) for k in (3, 4)]
+    ends = [decide.compose(adopted.after[k], decide.between(track[k], later)) for k in (3, 4)]
     np.testing.assert_allclose(adopted.republish(quarter, later), 0.75 * ends[0] + 0.25 * ends[1], atol=1e-9)
     # before the first keyframe: by the first
     first = adopted.republish(np.array([adopted.anchors[0] - 5]), track[:1])
@@ -185,9 +189,9 @@ def test_earlier_poses_are_republished_with_the_keyframes_around_them():
 def test_host_compose_and_between_are_those_of_the_device():
     rng = np.random.default_rng(0)
     a, b = rng.normal(size=(2, 3))
-    device = geometry.compose(jnp.asarray(a), jnp.asarray(b))
-    np.testing.assert_allclose(startup.compose(a, b), device, atol=1e-6)  # float32
-    np.testing.assert_allclose(startup.compose(a, startup.between(a, b)), b, atol=1e-12)
+    device = se2.compose(jnp.asarray(a), jnp.asarray(b))
+    np.testing.assert_allclose(decide.compose(a, b), device, atol=1e-6)  # float32
+    np.testing.assert_allclose(decide.compose(a, decide.between(a, b)), b, atol=1e-12)
 
 
 def test_biased_radios_are_told():
@@ -207,9 +211,9 @@ def test_a_long_start_is_thinned_without_losing_ranges():
     averages = kept.averages(kept.keyframes)
     # each range still stands where it was taken, half of them now half-way between two keyframes
     poses = np.array([key.pose for key in kept.keyframes])
-    from_before = poses[averages.at, :2] + keyframes.turned(poses[averages.at, 2], averages.before)
+    from_before = poses[averages.at, :2] + keyframe_buffer.turned(poses[averages.at, 2], averages.before)
     after = np.minimum(averages.at + 1, len(poses) - 1)
-    from_after = poses[after, :2] + keyframes.turned(poses[after, 2], averages.after)
+    from_after = poses[after, :2] + keyframe_buffer.turned(poses[after, 2], averages.after)
     np.testing.assert_allclose(from_before, from_after, atol=1e-9)
     assert set(np.round(averages.share, 6)) == {0.0, 0.5}
 

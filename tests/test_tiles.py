@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from uwbslam_jax import grid as occupancy
-from uwbslam_jax.grid import EPOCH_LEVEL, Grid
-from uwbslam_jax.tiles import TILE, Tiles
+from uwbslam_jax.mapping import grid as occupancy
+from uwbslam_jax.mapping.grid import EPOCH_LEVEL, Grid
+from uwbslam_jax.mapping.tiled_map import TILE, Tiles
 
 CELLS, LEVELS, RESOLUTION = 4 * TILE, 3, 0.1
 SIDE = TILE * RESOLUTION

@@ -8,25 +8,26 @@ import numpy as np
 import pytest
 import small_room as room
 
-from uwbslam_jax import layout, trust
-from uwbslam_jax.config import Config, Params, Settings, UwbSettings, make_params
-from uwbslam_jax.ekf import Gaussian
-from uwbslam_jax.layout import Nodes
-from uwbslam_jax.matching import Match
+from uwbslam_jax.estimator import state_vector
+from uwbslam_jax.estimator import match_fusion
+from uwbslam_jax.settings import Config, Params, Settings, UwbSettings, make_params
+from uwbslam_jax.numerics.gaussian import Gaussian
+from uwbslam_jax.estimator.state_vector import Nodes
+from uwbslam_jax.estimator.matching import Match
 
 BEACONS = np.array([[-3.5, -2.5], [4.0, -2.0], [1.0, 3.0]])
 NODES = 4
-SIZE = layout.state_size(NODES)
+SIZE = state_vector.state_size(NODES)
 PAIRS = [(0, 1), (2, 0), (0, 3)]
 CONFIG = Config(NODES, 8, 60, 0.1, 2, 128, 10.0, "robust", True, True, False)
 PARAMS: Params = make_params(Settings(uwb=UwbSettings(max_beacons=3)))
 STD = 0.02
-CALM = jnp.array(trust.CALM) ** 2
+CALM = jnp.array(match_fusion.CALM) ** 2
 
-weigh, fuse, learn_unrest = jax.jit(trust.weigh), jax.jit(trust.fuse), jax.jit(trust.learn_unrest)
-allow_jump, contradicted = jax.jit(trust.allow_jump), jax.jit(trust.contradicted)
-anchor, revisit, learn_spread = jax.jit(trust.anchor), jax.jit(trust.revisit), jax.jit(trust.learn_spread)
-AT, ERROR = np.array(layout.pose_indices(NODES)), np.array(layout.map_error_indices(NODES))
+weigh, fuse, learn_unrest = jax.jit(match_fusion.weigh), jax.jit(match_fusion.fuse), jax.jit(match_fusion.learn_unrest)
+allow_jump, contradicted = jax.jit(match_fusion.allow_jump), jax.jit(match_fusion.contradicted)
+anchor, revisit, learn_spread = jax.jit(match_fusion.anchor), jax.jit(match_fusion.revisit), jax.jit(match_fusion.learn_spread)
+AT, ERROR = np.array(state_vector.pose_indices(NODES)), np.array(state_vector.map_error_indices(NODES))
 
 
 def expecting(pose=(0.0, 0.0, 0.0), velocity=(0.0, 0.0)) -> Gaussian:
@@ -35,8 +36,8 @@ def expecting(pose=(0.0, 0.0, 0.0), velocity=(0.0, 0.0)) -> Gaussian:
     velocities[0] = velocity
     nodes = Nodes(*(jnp.asarray(x, jnp.float32) for x in (positions, velocities, pose[2], 0.0, np.zeros(3))))
     std = np.full(SIZE, 1e-3)
-    std[list(layout.pose_indices(NODES))] = STD
-    return Gaussian(layout.pack(nodes), jnp.asarray(np.diag(std**2), jnp.float32))
+    std[list(state_vector.pose_indices(NODES))] = STD
+    return Gaussian(state_vector.pack(nodes), jnp.asarray(np.diag(std**2), jnp.float32))
 
 
 def match(pose, score=0.85, known=1.0, informed=((1.0, 0.0), (0.0, 1.0))) -> Match:
@@ -88,13 +89,13 @@ def test_headings_are_compared_around_the_circle():
 def test_a_jump_is_followed_and_leaves_the_velocity_alone():
     jump = match((0.17, 0.0, 0.26))
     before = expecting(velocity=(0.3, 0.0))
-    assert float(weigh(jump, before, PARAMS, jnp.int32(1000))[0]) > trust.SURPRISE
+    assert float(weigh(jump, before, PARAMS, jnp.int32(1000))[0]) > match_fusion.SURPRISE
     belief = allow_jump(before, jump, jnp.array(True))
     surprise, information = weigh(jump, belief, PARAMS, jnp.int32(1000))
     assert float(surprise) < 5.0  # as wide as the jump is far: three coordinates of one sigma or less
     after = fuse(belief, jump, information)
-    np.testing.assert_allclose(layout.robot_pose(after.mean), jump.pose, atol=0.01)
-    np.testing.assert_allclose(layout.unpack(after.mean).velocities[0], [0.3, 0.0], atol=1e-3)
+    np.testing.assert_allclose(state_vector.robot_pose(after.mean), jump.pose, atol=0.01)
+    np.testing.assert_allclose(state_vector.unpack(after.mean).velocities[0], [0.3, 0.0], atol=1e-3)
     for same in (allow_jump(before, jump, jnp.array(False)), allow_jump(before, match((0.02, 0, 0)), jnp.array(True))):
         np.testing.assert_array_equal(same.cov, before.cov)
 
@@ -111,16 +112,16 @@ def test_ranges_that_were_taken_on_the_way_to_a_jump_do_not_contradict_it():
 
 
 def test_a_sure_match_fits_and_sees_enough():
-    sure = [bool(trust.is_sure(match(np.zeros(3), *fit))) for fit in [(0.85, 1.0), (0.5, 1.0), (0.85, 0.3)]]
+    sure = [bool(match_fusion.is_sure(match(np.zeros(3), *fit))) for fit in [(0.85, 1.0), (0.5, 1.0), (0.85, 0.3)]]
     assert sure == [True, False, False]
-    needed = [bool(trust.needs_jump(match(np.zeros(3), 0.85), jnp.array(fit))) for fit in (0.3, 0.8)]
+    needed = [bool(match_fusion.needs_jump(match(np.zeros(3), 0.85), jnp.array(fit))) for fit in (0.3, 0.8)]
     assert needed == [True, False]
 
 
 def learnt(errors, needed=0.1, std=STD) -> np.ndarray:
     """Standard deviations learnt from innovations (n, 3) where a spread of std was expected; those larger than
     `needed` are what the scan needs."""
-    unrest, belief, at = CALM, expecting(), jnp.array(layout.pose_indices(NODES))
+    unrest, belief, at = CALM, expecting(), jnp.array(state_vector.pose_indices(NODES))
     cov = belief.cov * (std / STD) ** 2
     for error in errors:
         belief = belief._replace(cov=cov.at[at, at].add(unrest[jnp.array([0, 0, 1])]))  # as it is predicted
@@ -132,20 +133,20 @@ def test_unrest_of_a_robot_that_jumps_is_learnt_and_forgotten():
     """Every fifth scan comes 0.2 m and 0.2 rad off, the others as expected."""
     rng = np.random.default_rng(0)
     errors = STD * rng.normal(size=(400, 3))
-    np.testing.assert_allclose(learnt(errors), trust.CALM, rtol=1e-6)
+    np.testing.assert_allclose(learnt(errors), match_fusion.CALM, rtol=1e-6)
     errors[::5, [0, 2]] += 0.2
     position, heading = learnt(errors)
     # the mean of x and y: 0.2 / sqrt(2) in a fifth of the scans, running over 20 scans
     np.testing.assert_allclose(position, 0.2 / np.sqrt(2) / np.sqrt(5), rtol=0.4)
     np.testing.assert_allclose(heading, 0.2 / np.sqrt(5), rtol=0.4)
-    assert bool(trust.restless(jnp.array([position, heading]) ** 2))
-    assert not bool(trust.restless(CALM))
+    assert bool(match_fusion.restless(jnp.array([position, heading]) ** 2))
+    assert not bool(match_fusion.restless(CALM))
 
 
 def test_what_the_scan_does_not_need_or_was_expected_anyway_teaches_nothing():
     errors = np.tile([0.2, 0.0, 0.2], (50, 1))
-    np.testing.assert_allclose(learnt(errors, needed=1.0), trust.CALM, rtol=1e-6)
-    np.testing.assert_allclose(learnt(errors, std=0.3), trust.CALM, rtol=1e-6)
+    np.testing.assert_allclose(learnt(errors, needed=1.0), match_fusion.CALM, rtol=1e-6)
+    np.testing.assert_allclose(learnt(errors, std=0.3), match_fusion.CALM, rtol=1e-6)
     assert learnt(errors).min() > 0.1
 
 
@@ -176,7 +177,7 @@ def test_where_all_is_new_the_map_errs_by_what_the_pose_errs_by():
     np.testing.assert_allclose(error, pose, atol=1e-7)
     np.testing.assert_allclose(cross, -pose, atol=1e-7)
     # a match there is expected where the scan was drawn, and nowhere else
-    expected = np.asarray(trust.expected_match(after)) - np.asarray(at)
+    expected = np.asarray(match_fusion.expected_match(after)) - np.asarray(at)
     np.testing.assert_allclose(np.exp(1j * expected), 1.0, atol=1e-5)
     # nothing is learnt of anything else
     others = np.setdiff1d(np.arange(SIZE), ERROR)
@@ -210,11 +211,11 @@ def test_ranges_that_mend_a_pose_mend_what_its_map_errs_by():
     np.testing.assert_allclose([mended[0], mended[ERROR[0]]], [0.1, -0.1], atol=1e-6)
 
 
-def spread(apart=0.0, views=1.0, way=50.0, epoch=20.0) -> trust.MapSpread:
-    return trust.MapSpread(apart * jnp.eye(3), jnp.float32(views), jnp.float32(way), jnp.float32(epoch))
+def spread(apart=0.0, views=1.0, way=50.0, epoch=20.0) -> match_fusion.MapSpread:
+    return match_fusion.MapSpread(apart * jnp.eye(3), jnp.float32(views), jnp.float32(way), jnp.float32(epoch))
 
 
-@pytest.mark.parametrize("seen", [0.0, 20.0, 20.0 + 0.9 * trust._OTHER_EPOCH, 20.0 - 0.9 * trust._OTHER_EPOCH])
+@pytest.mark.parametrize("seen", [0.0, 20.0, 20.0 + 0.9 * match_fusion._OTHER_EPOCH, 20.0 - 0.9 * match_fusion._OTHER_EPOCH])
 def test_ground_of_the_same_epoch_or_of_none_errs_as_before(seen):
     before, known = uncertain(), spread(1e-4)
     after, still = revisit(before, known, jnp.float32(seen), PARAMS)
@@ -237,7 +238,7 @@ def test_ground_of_another_epoch_errs_the_more_differently_the_more_was_driven_i
     near, far, ahead = added(10.0), added(5.0), added(35.0)
     sigma = np.array([PARAMS.sigma_map, PARAMS.sigma_map, PARAMS.sigma_map_yaw])
     want = np.zeros((SIZE, SIZE))
-    want[ERROR, ERROR] = 10.0 * (sigma**2 + apart / trust._PATCH_M)
+    want[ERROR, ERROR] = 10.0 * (sigma**2 + apart / match_fusion._PATCH_M)
     np.testing.assert_allclose(near, want, atol=1e-7)  # float32
     np.testing.assert_allclose(far, 1.5 * near, atol=1e-7)
     np.testing.assert_array_equal(far, ahead)  # whichever was drawn first
@@ -250,8 +251,8 @@ def test_ground_that_is_looked_at_on_and_on_is_another_only_once():
 
 
 def test_spread_is_the_mean_covariance_of_matches_where_new_ground_was_drawn():
-    known, covs, ways = trust.even_map(), [], [0.2, 0.3, 0.1]
-    C = np.asarray(layout.matched_pose_jacobian(NODES), float)
+    known, covs, ways = match_fusion.even_map(), [], [0.2, 0.3, 0.1]
+    C = np.asarray(state_vector.matched_pose_jacobian(NODES), float)
     for seed, way in enumerate(ways):
         belief = uncertain(seed)
         covs.append(C @ np.asarray(belief.cov, float) @ C.T)
@@ -260,13 +261,13 @@ def test_spread_is_the_mean_covariance_of_matches_where_new_ground_was_drawn():
         known = learn_spread(known, uncertain(9), jnp.zeros((3, 3)), jnp.float32(1.0))
     np.testing.assert_allclose(known.apart, np.mean(covs, axis=0), atol=1e-6)  # float32
     assert float(known.views) == pytest.approx(3.0)
-    assert float(known.way) == pytest.approx(float(trust.even_map().way) + sum(ways) + 3.0)
-    assert float(known.epoch) == float(trust.even_map().epoch)
+    assert float(known.way) == pytest.approx(float(match_fusion.even_map().way) + sum(ways) + 3.0)
+    assert float(known.epoch) == float(match_fusion.even_map().epoch)
 
 
 def test_half_a_view_of_new_ground_counts_half():
-    known = learn_spread(trust.even_map(), uncertain(0), jnp.eye(3), jnp.float32(0.0))
-    C = layout.matched_pose_jacobian(NODES)
+    known = learn_spread(match_fusion.even_map(), uncertain(0), jnp.eye(3), jnp.float32(0.0))
+    C = state_vector.matched_pose_jacobian(NODES)
     first, second = (C @ uncertain(seed).cov @ C.T for seed in (0, 1))
     known = learn_spread(known, uncertain(1), 0.5 * jnp.eye(3), jnp.float32(0.0))
     np.testing.assert_allclose(known.apart, (2 * first + second) / 3, atol=1e-6)  # float32

@@ -13,12 +13,16 @@ from test_slam import BEACONS, FLAT, PAIRS, PARAMS, knowing, room_map  # noqa: F
 from test_smoothing import ANTENNA, K, loop, make, solved
 from test_smoothing import BEACONS as SPOTS
 
-from uwbslam_jax import calibration, ranging, rollout, tunable, tuning
-from uwbslam_jax.config import ConfigError, Params, Settings
-from uwbslam_jax.graph import relative
-from uwbslam_jax.likelihood import Objective, Score
-from uwbslam_jax.settings_file import differences, from_dict
-from uwbslam_jax.startup import compose
+from uwbslam_jax.tuning import calibration
+from uwbslam_jax.estimator import ranging
+from uwbslam_jax.tuning import rollout
+from uwbslam_jax.tuning import parameters
+from uwbslam_jax.tuning import fit
+from uwbslam_jax.settings import ConfigError, Params, Settings
+from uwbslam_jax.backend.graph import relative
+from uwbslam_jax.tuning.likelihood import Objective, Score
+from uwbslam_jax.files.settings_file import differences, from_dict
+from uwbslam_jax.startup.decide import compose
 
 STEPS = 56
 """7 chunks of 8."""
@@ -42,7 +46,7 @@ def test_gradient_through_fifty_steps_agrees_with_central_differences(room_map):
     state, frames, params = double(knowing(finest, velocity=(0.3, 0.1))), double(drive(STEPS)), double(PARAMS)
 
     def value(logs, frames):
-        tuned = tunable.put(params, NAMES, logs)
+        tuned = parameters.put(params, NAMES, logs)
         told = rollout.checkpointed(FLAT, tuned, rollout.rescaled(tuned, params, state), frames)
         return jnp.sum(told.ranges) + jnp.sum(told.matches)
 
@@ -100,8 +104,8 @@ class Known(Objective):
 
     def value_and_gradient(self, logs):
         gradient = self.curvature * (logs - self.best)
-        total = 0.5 * gradient @ (logs - self.best) + 0.5 * np.sum((logs / tunable.LOG_SPREAD) ** 2)
-        gradient = gradient + logs / tunable.LOG_SPREAD**2
+        total = 0.5 * gradient @ (logs - self.best) + 0.5 * np.sum((logs / parameters.LOG_SPREAD) ** 2)
+        gradient = gradient + logs / parameters.LOG_SPREAD**2
         if self.floor is not None:
             noise, floor = np.exp(2 * logs[-1]), np.exp(2 * self.floor)
             total, gradient[-1] = total + 20 * np.log(noise + floor), gradient[-1] + 40 * noise / (noise + floor)
@@ -112,7 +116,7 @@ class Known(Objective):
 
 
 def test_a_fit_finds_the_minimum_and_its_curvature():
-    found = tuning.fit(Known([0.7, -1.2], [5000.0, 300.0]))
+    found = fit.fit(Known([0.7, -1.2], [5000.0, 300.0]))
     np.testing.assert_allclose(np.log(found.values), [0.7, -1.2], atol=0.01)  # the prior pulls by 0.001
     np.testing.assert_allclose(found.sigma, [5000**-0.5, 300**-0.5], rtol=0.01)
     assert found.told == ("", "")
@@ -121,7 +125,7 @@ def test_a_fit_finds_the_minimum_and_its_curvature():
 
 
 def test_what_is_not_observed_stays_where_it_was():
-    found = tuning.fit(Known([0.7, -1.2], [5000.0, 0.01]))
+    found = fit.fit(Known([0.7, -1.2], [5000.0, 0.01]))
     assert found.told == ("", "not observed")
     assert found.values[1] == 1.0
     np.testing.assert_allclose(np.log(found.values[0]), 0.7, atol=0.01)
@@ -129,7 +133,7 @@ def test_what_is_not_observed_stays_where_it_was():
 
 def test_what_is_told_from_one_side_is_a_bound():
     objective = Known([0.7, 0.0], [5000.0, 0.0], floor=-3.0)
-    found = tuning.fit(objective)
+    found = fit.fit(objective)
     assert found.told == ("", "at most")
     logs = np.log(found.values)
     least = min(objective.value(np.array([logs[0], at])) for at in np.linspace(-9.0, 0.0, 200))
@@ -139,7 +143,7 @@ def test_what_is_told_from_one_side_is_a_bound():
 
 
 def test_a_jump_nearby_is_told_and_does_not_hold_up_the_others():
-    found = tuning.fit(Known([0.7, 0.4], [5000.0, 300.0], jump=0.38))
+    found = fit.fit(Known([0.7, 0.4], [5000.0, 300.0], jump=0.38))
     assert list(found.jumps) == [False, True]
     np.testing.assert_allclose(np.log(found.values[0]), 0.7, atol=0.01)
 
@@ -157,7 +161,7 @@ class Twofold(Known):
 
 
 def test_the_deeper_of_two_valleys_is_found():
-    found = tuning.fit(Twofold([0.0], [500.0]))
+    found = fit.fit(Twofold([0.0], [500.0]))
     np.testing.assert_allclose(np.log(found.values), [0.7], atol=0.01)
 
 
@@ -168,17 +172,17 @@ def test_tuned_settings_are_read_back_as_they_were_written():
     import tomllib
 
     values = {"sigma_n": 0.0512345678, "bias.7": -0.1, "lidar.yaw": 0.05, "sigma_w": 0.3}
-    found = tunable.configured(Settings(), values)
+    found = parameters.configured(Settings(), values)
     again = from_dict(tomllib.loads(differences(found)))
     assert again == found
     for name, value in values.items():
-        np.testing.assert_allclose(tunable.value(again, name), value, rtol=1e-5)
+        np.testing.assert_allclose(parameters.value(again, name), value, rtol=1e-5)
 
 
 @pytest.mark.parametrize(("name", "near"), [("sigma", "sigma_"), ("bias.x", "bias.1"), ("lidar.z", "lidar.")])
 def test_an_unknown_parameter_names_the_nearest(name, near):
     with pytest.raises(ConfigError, match=f"did you mean {near}"):
-        tunable.check([name])
+        parameters.check([name])
 
 
 # Mounting and biases.

@@ -11,7 +11,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from uwbslam_jax import __version__, memory
+from uwbslam_jax import __version__
+from uwbslam_jax import process
 
 COMMANDS = {
     "demo": "simulate a robot in a workshop, run the recording, and report",
@@ -44,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _fail(f"no command {words[0]}{hint}")
     try:
         prepare()
-        from uwbslam_jax import commands
+        from uwbslam_jax.cli import commands
 
         return _guarded(commands, words)
     except KeyboardInterrupt:
@@ -85,7 +86,7 @@ def prepare() -> None:
     # the same holds for XLA's kernels of a step, each of which takes microseconds
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
     os.environ.setdefault("NPROC", "1")  # size of XLA's own thread pool
-    memory.few_arenas()
+    process.few_arenas()
 
 
 def usage() -> str:

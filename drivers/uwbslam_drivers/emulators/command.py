@@ -21,8 +21,8 @@ from uwbslam_drivers.emulators.plugs import Plug, PtyPlug, TcpPlug
 from uwbslam_drivers.emulators.robot import Departure, DeviceTime, write_truth
 from uwbslam_drivers.emulators.serve import EMULATORS, Server
 from uwbslam_drivers.source import DEVICES
-from uwbslam_jax.conditions import Scenario
-from uwbslam_jax.simulate import SCENARIOS, scenario
+from uwbslam_jax.sim.scenario import Scenario
+from uwbslam_jax.sim.simulate import SCENARIOS, scenario
 
 LOOPBACK = "127.0.0.1"
 _LOOK = 0.2

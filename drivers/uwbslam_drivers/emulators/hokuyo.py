@@ -12,7 +12,7 @@ from uwbslam_drivers import scip
 from uwbslam_drivers.emulators import robot
 from uwbslam_drivers.emulators.robot import DeviceTime
 from uwbslam_drivers.hokuyo import MS, UTM_30LX_EW, WRAP, Specification
-from uwbslam_jax.conditions import Scenario
+from uwbslam_jax.sim.scenario import Scenario
 from uwbslam_jax.measurements import ScanMessage
 
 PROCESSING = 1 * MS

@@ -1,0 +1,118 @@
+"""What the whole run tells, in the published frame: the track of every frame, the beacons, the keyframes to draw.
+
+The estimates that were published along the way stay what they were; this is what the files of a finished run hold.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from uwbslam_jax.settings import Params
+from uwbslam_jax.backend.graph import Graph, relative, wrapped
+from uwbslam_jax.session.history import History
+from uwbslam_jax.startup.keyframe_buffer import turned
+from uwbslam_jax.backend.range_means import Node
+from uwbslam_jax.backend.smoothing import Solution, solve
+from uwbslam_jax.startup.decide import compose, frame_motion, numeric_jacobian, published
+
+
+class Question(NamedTuple):
+    """What a solution of the run so far starts from.
+
+    Attributes:
+      graph: what was collected. poses: (N, 3) of its keyframes to start from [m, m, rad].
+      places: resting place of a beacon -> where it is, about (2,) [m].
+      params: with the heights and biases that the user configured.
+      frame_nodes: the resting places that make the published frame: its origin, and +x.
+      biased: whether ranges were found to be biased before.
+    """
+
+    graph: Graph
+    poses: np.ndarray
+    places: dict[Node, np.ndarray]
+    params: Params
+    frame_nodes: tuple[Node, Node]
+    biased: bool
+
+
+class Hindsight(NamedTuple):
+    """The run solved as a whole, in the published frame.
+
+    Attributes:
+      solution: with poses, beacons and covariance in that frame.
+      track: (T, 3) pose of every frame in the history [m, m, rad].
+    """
+
+    solution: Solution
+    track: np.ndarray
+
+
+def look_back(question: Question, history: History) -> Hindsight | None:
+    """The run so far solved as a whole; None where it has too little of it."""
+    solution = framed_solution(question)
+    return None if solution is None else Hindsight(solution, _track(question.graph, history, solution.poses))
+
+
+def framed_solution(question: Question) -> Solution | None:
+    """The solution, and its covariance, in the published frame."""
+    graph, poses, places, params, frame_nodes, biased = question
+    height, bias = np.asarray(params.height, float), np.asarray(params.bias, float)
+    solution = solve(graph, poses, places, height, bias, float(params.bias_scale), biased=biased)
+    return None if solution is None else _framed(solution, poses, frame_nodes)
+
+
+def _framed(solution: Solution, before: np.ndarray, frame_nodes: tuple[Node, Node]) -> Solution:
+    """The solution in the published frame: that of its two beacons, or where these are not part of it, where the track
+    was published."""
+    if all(node in solution.nodes for node in frame_nodes):
+        to_frame = partial(published, slots=solution.nodes, frame_slots=frame_nodes, onward=np.zeros(3))
+        motion = frame_motion(solution.beacons, solution.nodes, frame_nodes)
+    else:
+        motion = _fit(solution.poses, before)
+
+        def to_frame(x: np.ndarray) -> np.ndarray:
+            beacons = x[3:].reshape(-1, 2)
+            return np.concatenate([compose(motion, x[:3]), (motion[:2] + turned(motion[2], beacons)).ravel()])
+
+    x = np.concatenate([solution.poses[-1], solution.beacons.ravel()])
+    J = numeric_jacobian(to_frame, x)
+    beacons = motion[:2] + turned(motion[2], solution.beacons)
+    return solution._replace(poses=compose(motion, solution.poses), beacons=beacons, cov=J @ solution.cov @ J.T)
+
+
+def _fit(poses: np.ndarray, onto: np.ndarray) -> np.ndarray:
+    """(3,) the rigid motion that lays poses (N, 3) over others best."""
+    a, b = poses[:, :2] - poses[:, :2].mean(0), onto[:, :2] - onto[:, :2].mean(0)
+    theta = np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))
+    return np.append(onto[:, :2].mean(0) - turned(theta, poses[:, :2].mean(0)), theta)
+
+
+def _track(graph: Graph, history: History, after: np.ndarray) -> np.ndarray:
+    """(T, 3) every frame's pose, from those of the keyframes before and after it.
+
+    Where scans tell the position, the way between two keyframes is what the matches say; in a direction that a scan
+    cannot see, it is even.
+    """
+    stamps, poses = np.array(history.stamps), np.array(history.map_poses, float)
+    keys, before, broken = graph.stamps(), graph.poses(), graph.keyframes["broken"]
+    last = len(keys) - 1
+    k = np.clip(np.searchsorted(keys, stamps, side="right") - 1, 0, last)
+    n = np.minimum(k + 1, last)
+    n = np.where(broken[n], k, n)
+    share = np.clip((stamps - keys[k]) / np.maximum(keys[n] - keys[k], 1), 0.0, 1.0)
+    ends = [compose(after[j], relative(before[j], poses)) for j in (k, n)]
+    turn = wrapped(ends[1][:, 2] - ends[0][:, 2])
+    track = ends[0] + share[:, None] * np.column_stack([ends[1][:, :2] - ends[0][:, :2], turn])
+    even = after[k, :2] + share[:, None] * (after[n, :2] - after[k, :2])
+    inside = (n > k)[:, None]
+    sight = np.array(history.sight)
+    angle = np.where(np.isfinite(sight), sight, 0.0)
+    axis = np.stack([np.cos(angle), np.sin(angle)], -1)
+    apart = even - track[:, :2]
+    along = np.where(np.isfinite(sight)[:, None], axis * np.sum(axis * apart, axis=1)[:, None], 0.0)
+    along = np.where(np.isinf(sight)[:, None], apart, along)
+    track[:, :2] += np.where(inside, along, 0.0)
+    return track

@@ -1,0 +1,326 @@
+"""The graph of a whole run: keyframes, scans laid over older scans, and the ranges taken on the way.
+
+Collected while the steps run, solved by `smoothing`. Host arrays; grows with the way, not with the time, and its scans
+with the ground that was covered.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import jax
+import numpy as np
+from scipy import sparse
+
+from uwbslam_jax.numerics.row_buffer import Column
+from uwbslam_jax.settings import Config, Params
+from uwbslam_jax.startup.keyframe_buffer import turned
+from uwbslam_jax.measurements import Scan, Snapshot, StampedFrame
+from uwbslam_jax.backend.range_means import RangeMeans
+from uwbslam_jax.backend.registration import View, register, view
+from uwbslam_jax.estimator.step import Estimate
+
+_MOVED = (0.25, 0.2)
+"""A keyframe every so much of way or turn [m, rad]."""
+_BLIND_S = 0.5
+_BLIND_M = 0.3
+"""A keyframe also after this time where the scan tells the position no better than this."""
+_SEEN_M = 0.05
+"""A match that tells the position no better than this in some direction does not see it."""
+_FEWEST_RETURNS = 20
+"""A scan of fewer returns tells nothing."""
+_ANCHOR_M = 2.0
+"""A keyframe this far from every anchor is one: later scans are laid over anchors, so that a place that is passed
+again hangs on the first time and not on the time before."""
+_TURN_M = 1.0
+"""A turn of one radian makes two scans see as little of the same as so much way [m]."""
+_REACH_M = 10.0
+"""Anchors farther off are not tried."""
+_NEAREST = 2
+_TIES = 2 + _NEAREST
+"""A scan is laid over the one before, the nearest anchors, and the oldest one in reach."""
+_SHARE = 0.5
+"""Share of a scan's surfaces that have to lie on those of the older one."""
+_BELIEVED = (0.6, 0.6, 0.2)
+"""A scan that lies farther off than this from where the map has it was laid over something else [m, m, rad]."""
+_HANG_TOGETHER = 8
+"""So many keyframes whose scans lie over each other are a place."""
+_FOUND_S = 5.0
+"""A robot that was carried is found within so long."""
+_VIEWS = 64
+"""Scans that were last laid over others are kept ready for the next: 3 MB."""
+_SCANS_OF_A_PLACE = 8
+_PLACE = (1.5, 0.8)
+"""Scans taken so near to each other see the same [m, rad]; more than so many of them tell nothing new."""
+_MM = 1000.0
+"""Scans are kept in whole millimetres."""
+
+
+KEYFRAME = np.dtype(
+    [
+        ("stamp", np.int64),
+        ("frame", np.int32),
+        ("pose", np.float64, 3),
+        ("informed", np.float32, (3, 3)),
+        ("drift", np.float32, 2),
+        ("yaw_rate", np.float32),
+        ("wheels", np.float64, 3),
+        ("broken", np.bool_),
+    ]
+)
+"""One pose of the graph.
+
+stamp: [ns]; frame: number of it in the history. pose: where the map has it: what its match reported, or what was
+expected where nothing matched [m, m, rad]. informed: information of the match in the map's frame, 0 where there is
+none. drift: velocity in the robot's frame [m/s]; yaw_rate [rad/s]. wheels: motion since the keyframe before by
+odometry, NaN where it was not measured all the way. broken: whether the robot was carried on the way from the keyframe
+before.
+"""
+
+EDGE = np.dtype([("old", np.int32), ("new", np.int32), ("between", np.float64, 3), ("information", np.float32, (3, 3))])
+"""A keyframe relative to an older one, by their scans.
+
+old, new: numbers of the keyframes. between: pose of the new one in the frame of the old one [m, m, rad]. information:
+of it, in that frame.
+"""
+
+
+@dataclass
+class Graph:
+    """What was collected so far.
+
+    Attributes:
+      ranges: see there. keyframes: rows of KEYFRAME; edges: rows of EDGE.
+      scans: of each keyframe what it saw, lengths in millimetres; None where there was nothing to see, or others saw
+        the same.
+    """
+
+    ranges: RangeMeans
+    keyframes: Column = field(default_factory=lambda: Column(dtype=KEYFRAME))
+    edges: Column = field(default_factory=lambda: Column(dtype=EDGE))
+    scans: list[Scan | None] = field(default_factory=list)
+    _wheels: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    _broken: bool = False
+    _anchors: list[int] = field(default_factory=list)
+    _settled: int = 0
+    _kept: list[int] = field(default_factory=list)
+    _views: dict[int, View] = field(default_factory=dict)
+
+    def copy(self) -> Graph:
+        """What there is now; what is added later does not change it."""
+        return Graph(self.ranges.copy(), self.keyframes.copy(), self.edges.copy(), list(self.scans))
+
+    def poses(self) -> np.ndarray:
+        """(N, 3) where the map has the keyframes [m, m, rad]."""
+        return self.keyframes["pose"].copy()
+
+    def stamps(self) -> np.ndarray:
+        """(N,) of the keyframes [ns]."""
+        return self.keyframes["stamp"].copy()
+
+    def blind(self) -> np.ndarray:
+        """(N,) whether a keyframe's scan does not tell where it is in some direction."""
+        return _blind(self.keyframes["informed"])
+
+    def rolled(self) -> np.ndarray:
+        """(N,) whether wheels measured all the way from the keyframe before."""
+        return np.isfinite(self.keyframes["wheels"][:, 0])
+
+    def snapshot(self, number: int) -> Snapshot:
+        """The scan of a keyframe that has one, as it was."""
+        packed, key = self.scans[number], self.keyframes[number]
+        assert packed is not None
+        reach = packed.ranges.astype(np.float32) / np.float32(_MM)
+        return Snapshot(packed._replace(ranges=reach, valid=packed.ranges > 0), key["drift"].copy(), key["yaw_rate"])
+
+    def seen(self, poses: np.ndarray, first: int = 0) -> Iterator[tuple[np.ndarray, Snapshot]]:
+        """What may be drawn, from a first keyframe on, at poses (N, 3): scans that hang together with many others.
+
+        A few that hang only on each other were taken where nothing could be told: in somebody's arms, in smoke.
+        """
+        count, old, new = len(self.keyframes), self.edges["old"], self.edges["new"]
+        tied = sparse.coo_array((np.ones(len(old)), (old, new)), shape=(count, count))
+        _, part = sparse.csgraph.connected_components(tied, directed=False)
+        size = np.bincount(part, minlength=1)
+        kept = size >= min(_HANG_TOGETHER, size.max())
+        drawn = [k for k in np.flatnonzero(kept[part]).tolist() if k >= first and self.scans[k] is not None]
+        return ((poses[k], self.snapshot(k)) for k in drawn)
+
+    def placed(self, slot: int, since: int) -> None:
+        """A beacon was found to rest where it was ranged from a time on [ns]; where it was before, nobody knows."""
+        self.ranges.forget(slot, int(np.searchsorted(self.keyframes["stamp"], since)))
+
+    def moved(self, slot: int) -> None:
+        """A beacon is, or the robot (slot 0) was, somewhere else from now on."""
+        if slot == 0:
+            self._broken = True
+            self._doubt_last()
+        else:
+            self.ranges.moved(slot)
+
+    def _doubt_last(self) -> None:
+        """The robot was carried: its scans since one did not lie over the one before are not believed."""
+        if not len(self.keyframes):
+            return
+        loose = self.keyframes["stamp"] > self.keyframes["stamp"][-1] - _FOUND_S * 1e9
+        loose[0] = False
+        loose[self.edges["new"][self.edges["old"] == self.edges["new"] - 1]] = False
+        if loose.any():
+            first = int(np.argmax(loose))
+            self.edges.keep(self.edges["new"] < first)
+            self._anchors = [k for k in self._anchors if k < first]
+            self.scans[first:] = [None] * (len(self.scans) - first)
+
+    def put(self, poses: np.ndarray, turn: float) -> None:
+        """The map was drawn again: keyframes so far are at poses (N, 3) in it, turned by an angle [rad]."""
+        R = np.eye(3)
+        c, s = np.cos(turn), np.sin(turn)
+        R[:2, :2] = [[c, -s], [s, c]]
+        self.keyframes["pose"][:] = poses
+        self.keyframes["informed"][:] = R @ self.keyframes["informed"] @ R.T
+
+    def add(self, config: Config, params: Params, number: int, frame: StampedFrame, estimate: Estimate) -> None:
+        """Take in one frame. number: in the history."""
+        pose = map_pose(estimate)
+        self.ranges.hear(frame, estimate, pose, params, config.nlos_gap_db)
+        self._roll(frame)
+        informed = np.asarray(estimate.information, float)
+        if len(self.keyframes) and not self._far(pose, frame.stamp, informed):
+            return
+        if self._broken or not len(self.keyframes):
+            self.ranges.drop()
+        else:
+            last = self.keyframes[-1]
+            stamps = int(last["stamp"]), frame.stamp
+            self.ranges.close(len(self.keyframes) - 1, stamps, (last["pose"], pose))
+        drift = turned(-pose[2], np.asarray(estimate.velocity, float))
+        told = pose, informed, drift, estimate.yaw_rate, self._wheels, self._broken
+        self.keyframes.append((frame.stamp, number, *told))
+        self.scans.append(_packed(frame.frame.scan) if _sees(frame) else None)
+        self._wheels, self._broken = np.zeros(3), False
+        if self.scans[-1] is not None:
+            self._tie(params)
+        self._thin()
+
+    def _far(self, pose: np.ndarray, stamp: int, informed: np.ndarray) -> bool:
+        last = self.keyframes[-1]
+        # plain numbers: asked for every frame
+        (x, y, yaw), (x0, y0, yaw0) = pose.tolist(), last["pose"].tolist()
+        turn = math.remainder(yaw - yaw0, 2 * math.pi)
+        late = stamp - int(last["stamp"]) > _BLIND_S * 1e9 and bool(_blind(informed[None])[0])
+        return self._broken or math.hypot(x - x0, y - y0) > _MOVED[0] or abs(turn) > _MOVED[1] or late
+
+    def _roll(self, frame: StampedFrame) -> None:
+        odometry = frame.frame.odometry
+        if not bool(odometry.valid):
+            self._wheels = np.full(3, np.nan)
+        elif np.isfinite(self._wheels[0]):
+            step = np.asarray(odometry.increment, float)
+            self._wheels = np.append(self._wheels[:2] + turned(self._wheels[2], step[:2]), self._wheels[2] + step[2])
+
+    def _tie(self, params: Params) -> None:
+        """Edges from the newest keyframe to older ones whose scans it can be laid over."""
+        new = len(self.keyframes) - 1
+        old = self._candidates(new)
+        if not old:
+            return
+        padded = (old * _TIES)[:_TIES]  # always as many: nothing is compiled again
+        guess = relative(self.keyframes["pose"][padded], self.keyframes["pose"][new])
+        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *(self._view(params, k) for k in padded))
+        found = jax.device_get(register(stacked, self._view(params, new), np.float32(guess)))
+        believed = np.all(np.abs(found.pose - guess) < _BELIEVED, axis=1) & (found.share > _SHARE)
+        for k in np.flatnonzero(believed[: len(old)]):
+            self.edges.append((old[k], new, found.pose[k], found.information[k]))
+
+    def _view(self, params: Params, number: int) -> View:
+        """The scan of a keyframe, made ready."""
+        made = self._views.pop(number, None)
+        self._views[number] = made or jax.device_get(view(params, self.snapshot(number)))
+        if len(self._views) > _VIEWS:
+            del self._views[next(iter(self._views))]
+        return self._views[number]
+
+    def _candidates(self, new: int) -> list[int]:
+        """Keyframes to lay the newest one over: the last one, the nearest anchors, the oldest anchor in reach."""
+        poses, pose = self.keyframes["pose"][self._anchors], self.keyframes["pose"][new]
+        apart = np.linalg.norm(poses[:, :2] - pose[:2], axis=1)
+        cost = apart + np.abs(wrapped(poses[:, 2] - pose[2])) * _TURN_M
+        near = [self._anchors[k] for k in np.argsort(cost, kind="stable")[:_NEAREST] if apart[k] < _REACH_M]
+        oldest = [self._anchors[k] for k in np.flatnonzero(apart < _REACH_M)[:1]]
+        last = self._last_seen(new)
+        if not len(cost) or cost.min() > _ANCHOR_M:
+            self._anchors.append(new)
+        return list(dict.fromkeys([*last, *near, *oldest]))
+
+    def _last_seen(self, new: int) -> list[int]:
+        """The keyframe with a scan before the newest one, where the robot was not carried since."""
+        for k in range(new, 0, -1):
+            if self.keyframes["broken"][k]:
+                break
+            if self.scans[k - 1] is not None:
+                return [k - 1]
+        return []
+
+    def _thin(self) -> None:
+        """Leave out the oldest scan of a place that enough others were taken at, but not an anchor's.
+
+        So the scans of a run are bounded by the ground, and the map is drawn from the newest. What may still be found
+        to have been taken in somebody's arms covers nothing.
+        """
+        poses, newest = self.keyframes["pose"], self.keyframes["stamp"][-1]
+        while self.keyframes["stamp"][self._settled] <= newest - _FOUND_S * 1e9:
+            k, self._settled = self._settled, self._settled + 1
+            if self.scans[k] is None:
+                continue
+            off = poses[self._kept] - poses[k]
+            same = (np.hypot(*off[:, :2].T) < _PLACE[0]) & (np.abs(wrapped(off[:, 2])) < _PLACE[1])
+            others = [self._kept[n] for n in np.flatnonzero(same)]
+            self._kept.append(k)
+            spare = [other for other in others if other not in self._anchors]
+            if len(others) >= _SCANS_OF_A_PLACE and spare:
+                self.scans[spare[0]] = None
+                self._kept.remove(spare[0])
+
+
+def map_pose(estimate: Estimate) -> np.ndarray:
+    """(3,) where the map has the robot: the match, or what was expected of it where nothing matched [m, m, rad]."""
+    if np.any(estimate.information):
+        return np.asarray(estimate.matched_pose, float)
+    return np.asarray(estimate.pose, float) + np.asarray(estimate.map_error, float)
+
+
+def sight(estimate: Estimate) -> float:
+    """What a match told of the position: NaN for all of it, inf for nothing, else the direction that it cannot see, in
+    the map's frame [rad]."""
+    (xx, xy), (_, yy) = estimate.information[:2, :2].tolist()
+    mean, spread = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)  # the eigenvalues are mean -+ spread
+    if mean - spread > _SEEN_M**-2:
+        return math.nan
+    along = 0.5 * math.atan2(2 * xy, xx - yy)  # where most is seen
+    return along + 0.5 * math.pi if mean + spread > _SEEN_M**-2 else math.inf
+
+
+def relative(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Poses b in the frames of poses a, both (..., 3); the angle is not wrapped."""
+    return np.concatenate([turned(-a[..., 2], b[..., :2] - a[..., :2]), b[..., 2:] - a[..., 2:]], axis=-1)
+
+
+def wrapped(angle):
+    """The same angles in [-pi, pi) [rad]."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+def _blind(informed: np.ndarray) -> np.ndarray:
+    return np.linalg.eigvalsh(informed[..., :2, :2])[..., 0] < _BLIND_M**-2
+
+
+def _sees(frame: StampedFrame) -> bool:
+    return bool(frame.frame.has_scan) and int(np.sum(frame.frame.scan.valid)) > _FEWEST_RETURNS
+
+
+def _packed(scan: Scan) -> Scan:
+    millimetres = np.where(scan.valid, np.round(np.asarray(scan.ranges, float) * _MM), 0)
+    # what is farther off than 16 bits can tell is farther off than the map's window
+    return scan._replace(ranges=np.where(millimetres < 2**16, millimetres, 0).astype(np.uint16), valid=None)

@@ -1,0 +1,163 @@
+"""Ranges of a run, averaged between keyframes, by the place where each beacon rests. Host arrays; bounded by the way.
+
+Raw ranges wait until the next keyframe is there: only then is it known where on the way they were taken.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict, deque
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from uwbslam_jax.numerics.row_buffer import Column
+from uwbslam_jax.settings import Params
+from uwbslam_jax.startup.keyframe_buffer import mean_sigma
+from uwbslam_jax.measurements import StampedFrame
+from uwbslam_jax.estimator.step import Estimate
+
+_WINDOW = 21
+"""So many ranges of a pair tell how much they scatter."""
+_WILD_M = 0.5
+"""A range this far from the median of its interval takes no part in the mean."""
+_MOST = 400
+"""Newest ranges of a pair that are kept: of two beacons, or while the robot rests."""
+
+Node = tuple[int, int]
+"""A beacon at one of its resting places: slot, number of the place."""
+
+
+MEAN = np.dtype(
+    [
+        ("at", np.int32),
+        ("slot", np.int32),
+        ("place", np.int32),
+        ("share", np.float32),
+        ("before", np.float32, 2),
+        ("after", np.float32, 2),
+        ("distance", np.float32),
+        ("sigma", np.float32),
+        ("loud", np.bool_),
+    ]
+)
+"""Ranges between the robot and a beacon at rest, averaged over half an interval between two keyframes.
+
+at: keyframe before. slot, place: the node. share: of the way to the next keyframe. before, after: the antenna in the
+frame of the keyframe before and of the one after [m]. distance: as measured, sigma: its standard deviation [m]. loud:
+whether the ranges scatter more than the radio does.
+"""
+
+
+class _Heard(NamedTuple):
+    """One range of the robot: when [ns], where the antenna was on the map [m], distance [m]."""
+
+    stamp: float
+    x: float
+    y: float
+    distance: float
+
+
+@dataclass
+class RangeMeans:
+    """What was ranged so far.
+
+    Attributes:
+      sigma_n: standard deviation of a range [m].
+      means: rows of MEAN. pairs: newest ranges between two beacons at rest, by their nodes.
+    """
+
+    sigma_n: float
+    means: Column = field(default_factory=lambda: Column(dtype=MEAN))
+    pairs: dict[tuple[Node, Node], deque[float]] = field(default_factory=dict)
+    _places: dict[int, int] = field(default_factory=dict)
+    _newest: dict[int, deque[float]] = field(default_factory=dict)
+    _open: dict[Node, deque[_Heard]] = field(default_factory=dict)
+
+    def copy(self) -> RangeMeans:
+        """The means and pairs there are now; what is added later does not change them."""
+        pairs = {pair: deque(kept) for pair, kept in self.pairs.items()}
+        return RangeMeans(self.sigma_n, self.means.copy(), pairs)
+
+    def node(self, slot: int) -> Node:
+        """The place where a beacon rests now."""
+        return slot, self._places.get(slot, 0)
+
+    def moved(self, slot: int) -> None:
+        """A beacon is somewhere else from now on."""
+        self._places[slot] = self._places.get(slot, 0) + 1
+        self._newest.pop(slot, None)
+
+    def forget(self, slot: int, before: int) -> None:
+        """Leave out the means of a beacon's present place from before a keyframe: it may have been elsewhere then."""
+        rows, (_, place) = self.means.values, self.node(slot)
+        self.means.keep((rows["slot"] != slot) | (rows["place"] != place) | (rows["at"] >= before))
+
+    def hear(
+        self, frame: StampedFrame, estimate: Estimate, pose: np.ndarray, params: Params, nlos_gap_db: float
+    ) -> None:
+        """Take in one frame's ranges between nodes at rest, or that are not known to move. pose: (3,) on the map."""
+        r = frame.frame.ranges
+        moving = np.asarray(estimate.moving)
+        usable = np.asarray(r.valid) & ~(np.asarray(r.power_gap) > nlos_gap_db) & ~(moving[r.i] | moving[r.j])
+        # plain numbers: a hundred of these ranges a frame are handled one by one
+        ahead, left = np.asarray(params.antenna, float).tolist()
+        (x, y, yaw), (vx, vy), turning = pose.tolist(), estimate.velocity.tolist(), float(estimate.yaw_rate)
+        columns = (np.asarray(column)[usable].tolist() for column in (r.i, r.j, r.range, r.age))
+        for a, b, distance, age in zip(*columns, strict=True):
+            i, j = min(a, b), max(a, b)
+            if i > 0:
+                self.pairs.setdefault((self.node(i), self.node(j)), deque(maxlen=_MOST)).append(distance)
+                continue
+            c, s = math.cos(yaw + age * turning), math.sin(yaw + age * turning)
+            place = x + age * vx + c * ahead - s * left, y + age * vy + s * ahead + c * left
+            self._newest.setdefault(j, deque(maxlen=_WINDOW)).append(distance)
+            heard = _Heard(frame.stamp + age * 1e9, *place, distance)
+            self._open.setdefault(self.node(j), deque(maxlen=_MOST)).append(heard)
+
+    def _scatter(self, slot: int) -> float:
+        """Standard deviation of a pair's newest ranges by their second differences, see keyframes [m]."""
+        d = np.array(self._newest.get(slot, ()))
+        if len(d) < _WINDOW:
+            return self.sigma_n
+        # the median of |x| of a normal x is 0.674 sigma, and a second difference has 6 sigma^2
+        return float(np.median(np.abs(d[2:] - 2 * d[1:-1] + d[:-2])) / (0.674 * np.sqrt(6.0)))
+
+    def close(self, at: int, stamps: tuple[int, int], poses: tuple[np.ndarray, np.ndarray]) -> None:
+        """Average what was heard on the way from one keyframe to the next.
+
+        Args:
+          at: number of the first. stamps [ns], poses (3,) of both.
+        """
+        span = max(stamps[1] - stamps[0], 1)
+        for node, heard in self._open.items():
+            scatter = self._scatter(node[0])
+            # two means in each interval: one would leave the keyframes free to move to and fro between their middles
+            halves: dict[bool, list[_Heard]] = defaultdict(list)
+            for one in heard:
+                halves[one.stamp - stamps[0] >= span / 2].append(one)
+            for some in halves.values():
+                self.means.append((at, *node, *self._mean(stamps[0], span, poses, scatter, some)))
+        self.drop()
+
+    def drop(self) -> None:
+        """Leave out what was heard since the last keyframe."""
+        self._open.clear()
+
+    def _mean(self, start, span, poses, scatter, heard: list[_Heard]) -> tuple:
+        """The fields of MEAN from the share on."""
+        middle = sorted(one.distance for one in heard)[len(heard) // 2]  # one of them, so at least one is near it
+        ok = [one for one in heard if abs(one.distance - middle) < _WILD_M]
+        stamp, *antenna, distance = (sum(column) / len(ok) for column in zip(*ok, strict=True))
+        share = min(max((stamp - start) / span, 0.0), 1.0)
+        before, after = (_within(pose.tolist(), *antenna) for pose in poses)
+        sigma = mean_sigma(len(ok), scatter, self.sigma_n)
+        loud = sigma > mean_sigma(1, self.sigma_n, self.sigma_n)
+        return (share, before, after, distance, sigma, loud)
+
+
+def _within(pose: list[float], x: float, y: float) -> tuple[float, float]:
+    """A place in the frame of a pose [m]."""
+    c, s, dx, dy = math.cos(pose[2]), math.sin(pose[2]), x - pose[0], y - pose[1]
+    return c * dx + s * dy, c * dy - s * dx

@@ -1,0 +1,288 @@
+"""A beacon's life after start-up (DESIGN 1.7): joining, falling silent, being carried, coming back; the robot's too.
+
+Host code that looks at a few frames at a time. A beacon that is not in the state is placed from its newest ranges to
+nodes of known place, at rest or carried, when they leave one place only. One whose ranges say that it moves is taken
+to be carried, until they say that it rests; one that is not heard for long leaves the state.
+"""
+
+from __future__ import annotations
+
+import statistics
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from uwbslam_jax.beacons import state_edits
+from uwbslam_jax.estimator import ranging
+from uwbslam_jax.settings import Params, Settings
+from uwbslam_jax.beacons.range_table import Heard, heard
+from uwbslam_jax.measurements import StampedFrame
+from uwbslam_jax.numerics.multilateration import locate
+from uwbslam_jax.beacons.evidence import DISTANCE, MEMORY_S, NORMALISED, OTHER, Known, Sightings, Verdict, calm, carried_place, judge, resting_elsewhere, resting_place
+from uwbslam_jax.estimator.step import Estimate, State
+
+_SILENT_S = 3.0
+_DROP_S = 60.0
+_SILENT_WALK = 0.01
+"""Random walk of the place of a beacon that is not heard: somebody may push it [m/s^0.5]."""
+_DOUBTED_S = 5.0
+"""Ranges that do not fit for so long are told about."""
+_LOST_M = 3.0
+"""A carried beacon that is known no better than this has been lost."""
+_WATCHED_S = 2.0
+"""Of a beacon whose ranges fit, so much is remembered."""
+_MISFIT = 4.0
+"""Median absolute normalised innovation of a node's ranges to the robot beyond which they do not fit."""
+_CARRIED_SHARE = 0.4
+_FOUND_SHARE = 0.7
+"""When the robot's ranges to so many of the beacons stop fitting at once, and one other place explains so many of
+them, it is the robot that was carried. The filter may have settled where two or three of them fit by chance."""
+_CARRIED_S = 0.5
+_CARRIED_M = 0.5
+"""A robot that was carried less far finds itself by its scans."""
+_FITTING_SCORE = 0.7
+_CONTRADICTED_S = 3.0
+"""Where the scans fit, the ranges must speak against them for so long: ranges through walls and biases do so at times,
+but not from one other place for long."""
+_NEWEST = 4
+"""So many of a beacon's newest ranges place a robot that was carried."""
+
+_WATCHED = ("static", "moving", "silent")
+
+Event = tuple[int, str]
+
+
+@dataclass
+class _Life:
+    """What the host knows of one slot. heard: when last [s]; doubted: since when its ranges do not fit [s], None where
+    they do; told: whether that was told."""
+
+    status: str = "waiting"
+    heard: float = 0.0
+    doubted: float | None = None
+    told: bool = False
+    sightings: Sightings = field(default_factory=Sightings)
+
+
+class _Copied:
+    """What is asked of a state for every slot, on the host: copied once and not for each."""
+
+    def __init__(self, state: State, sigma_n: float):
+        k = state.active.shape[0]
+        self.of = state
+        places, velocities = np.asarray(state.belief.mean, float)[: 4 * k].reshape(2, k, 2)
+        self.places = places
+        self.variance = np.max(np.diag(np.asarray(state.belief.cov, float))[: 2 * k].reshape(k, 2), axis=1)
+        self.variance[0] = 0.0  # the robot's track is taken as a whole, see beacon_state.place
+        self.rests = np.asarray(state.active) & ~np.asarray(state.moving)
+        self.noise = sigma_n * ranging.loudness(np.asarray(state.scatter.log, float), np)
+        self.velocities = np.where(np.asarray(state.moving)[:, None], velocities, 0.0)
+        self.calm: tuple[tuple[float, list[int]], set[int]] | None = None  # when, and with whom doubted
+
+
+class BeaconKeeper:
+    """Life of all beacons; see the module's first lines."""
+
+    def __init__(self, settings: Settings):
+        self._nlos_gap_db = settings.uwb.nlos_gap_db
+        self._sigma_n = settings.uwb.sigma_n
+        self._lives: dict[int, _Life] = {}
+        self._start: int | None = None
+        self._copied: _Copied | None = None
+        self._contradicted: float | None = None  # since when another place explains the robot's ranges [s]
+
+    def status(self, slot: int) -> str:
+        """static, moving, silent, dropped or waiting."""
+        return self._life(slot).status
+
+    def placed(self, slot: int, stamp: int) -> None:
+        """Start-up has put a beacon into the state."""
+        life = self._life(slot)
+        life.status, life.heard = "static", self._seconds(stamp)
+
+    def _life(self, slot: int) -> _Life:
+        return self._lives.setdefault(slot, _Life())
+
+    def _seconds(self, stamp: int) -> float:
+        self._start = stamp if self._start is None else self._start
+        return (stamp - self._start) / 1e9
+
+    def look(
+        self, state: State, params: Params, pending: list[tuple[StampedFrame, Estimate]]
+    ) -> tuple[State, list[Event]]:
+        """The state after what a few frames told about the beacons, and what happened to which slot."""
+        self._seconds(pending[0][0].stamp)  # time counts from the first frame
+        self._listen(heard(pending, params))
+        span = self._seconds(pending[-1][0].stamp) - self._seconds(pending[0][0].stamp)
+        now = self._seconds(pending[-1][0].stamp)
+        share, found = self._find_carried_robot(state, self._known(state, now, 0))
+        believed = self._believes(found, share, now, [e for frame, e in pending if frame.frame.has_scan])
+        if found is not None and believed:
+            for life in self._lives.values():
+                life.sightings.forget(other=0)
+            return state_edits.put_robot(state, found), [(0, "was carried: found again by its ranges")]
+        events: list[Event] = []
+        for slot, life in sorted(self._lives.items()):
+            known = self._known(state, now, slot)
+            if life.status in ("waiting", "dropped"):
+                state = self._try_to_place(state, known, slot, life, events)
+            elif life.status == "moving":
+                state = self._follow(state, known, slot, life, events)
+            elif share <= _FOUND_SHARE:  # so many at once are not the beacons' fault
+                state = self._watch(state, known, slot, life, span, events)
+            trusted = life.status in ("static", "silent") and life.doubted is None
+            life.sightings.forget(before=now - (_WATCHED_S if trusted else MEMORY_S))
+        return state, events
+
+    def _known(self, state: State, now: float, slot: int) -> Known:
+        if self._copied is None or self._copied.of is not state:
+            self._copied = _Copied(state, self._sigma_n)
+        trusted = self._copied.rests.copy()
+        trusted[self._doubted()] = False
+        noise = self._copied.noise[slot]
+        return Known(self._copied.places, self._copied.variance, trusted, self._sigma_n, noise, now)
+
+    def _doubted(self) -> list[int]:
+        return [slot for slot, life in self._lives.items() if life.doubted is not None]
+
+    def _judge(self, known: Known, slot: int) -> Verdict:
+        """What a node's newest ranges say, see `judge`; all nodes are looked at together, for as long as nothing is
+        found about one. known: of the state that was copied last."""
+        copied, asked = self._copied, (known.now, self._doubted())
+        assert copied is not None
+        if copied.calm is None or copied.calm[0] != asked:
+            watched = {k: life.sightings for k, life in self._lives.items() if life.status in _WATCHED}
+            copied.calm = asked, calm(watched, known, copied.noise, copied.velocities)
+        if slot in copied.calm[1]:
+            return Verdict(True, None, np.zeros((0, 6)), 0.0)
+        return judge(self._lives[slot].sightings, known, slot, copied.velocities[slot])
+
+    def _listen(self, ranges: Heard) -> None:
+        """Remember each usable range to a node of known place."""
+        kept = ~(ranges.power_gap > self._nlos_gap_db)
+        ranges = ranges._replace(**{name: column[kept] for name, column in ranges._asdict().items()})
+        time = (ranges.stamp - (self._start or 0)) / 1e9
+        columns = [time + ranges.age, ranges.i, *ranges.antenna.T, ranges.flat, ranges.normalised]
+        for node, other, usable in ((ranges.i, ranges.j, ranges.rests_j), (ranges.j, ranges.i, ranges.rests_i)):
+            columns[OTHER] = other
+            rows = np.stack(columns, axis=1)
+            for slot in map(int, np.unique(node[node > 0])):
+                life, mine = self._life(slot), node == slot
+                life.heard = max(life.heard, float(time[mine][-1]))
+                if (mine & usable).any():
+                    life.sightings.add(rows[mine & usable])
+
+    def _try_to_place(self, state: State, known: Known, slot: int, life: _Life, events: list[Event]) -> State:
+        resting = resting_place(life.sightings, known)
+        found = resting or carried_place(life.sightings, known)
+        if found is None:
+            return state
+        self._enter(slot, life, "moving" if resting is None else "static", known)
+        events.append((slot, "placed while it is carried" if resting is None else "placed"))
+        return state_edits.place(state, slot, *found, moving=resting is None)
+
+    def _enter(self, slot: int, life: _Life, status: str, known: Known) -> None:
+        """A beacon is at a new place: what was ranged to or from its old one is of no use."""
+        life.status, life.doubted, life.told = status, None, False
+        life.sightings.forget(before=known.now - 1.0)
+        for other in self._lives.values():
+            other.sightings.forget(other=slot)
+
+    def _follow(self, state: State, known: Known, slot: int, life: _Life, events: list[Event]) -> State:
+        """A beacon that is being carried: rests, is followed, or is lost."""
+        resting = resting_place(life.sightings, known)
+        if resting is not None:
+            self._enter(slot, life, "static", known)
+            events.append((slot, "was put down: rests at a new place"))
+            return state_edits.place(state, slot, *resting, moving=False)
+        quiet = known.now - life.heard
+        if quiet > _SILENT_S or known.variance[slot] > _LOST_M**2:
+            life.status = "waiting"
+            events.append((slot, "fell silent while it was carried" if quiet > _SILENT_S else "was lost while carried"))
+            return state_edits.remove(state, slot)
+        verdict = self._judge(known, slot)
+        if verdict.carried is not None:
+            return state_edits.place(state, slot, verdict.carried, verdict.rows, moving=True)
+        return state
+
+    def _watch(self, state: State, known: Known, slot: int, life: _Life, span: float, events: list[Event]) -> State:
+        """A beacon that rests: is it still there, and heard?"""
+        quiet = known.now - life.heard
+        if quiet > _DROP_S:
+            life.status = "dropped"
+            events.append((slot, "dropped: not heard for a minute"))
+            return state_edits.remove(state, slot)
+        if (quiet > _SILENT_S) != (life.status == "silent"):
+            life.status = "silent" if quiet > _SILENT_S else "static"
+            events.append((slot, "fell silent" if life.status == "silent" else "is heard again"))
+        if life.status == "silent":
+            return state_edits.loosen(state, slot, _SILENT_WALK**2 * span)
+        verdict = self._judge(known, slot)
+        if verdict.carried is not None:
+            self._enter(slot, life, "moving", known)
+            events.append((slot, "is being carried"))
+            return state_edits.place(state, slot, verdict.carried, verdict.rows, moving=True)
+        return self._doubt(state, known, slot, life, verdict, events)
+
+    def _doubt(
+        self, state: State, known: Known, slot: int, life: _Life, verdict: Verdict, events: list[Event]
+    ) -> State:
+        """A beacon whose ranges fit neither its place nor a motion: a clock, walls, or only the robot hears it."""
+        if verdict.fits:
+            if life.told:
+                events.append((slot, "ranges fit again"))
+            life.doubted, life.told = None, False
+            return state
+        if life.doubted is None:
+            life.doubted = known.now
+            life.sightings.forget(before=known.now - 1.0)  # what it ranged from its old place
+        elsewhere = resting_elsewhere(life.sightings, known, slot)
+        if elsewhere is not None:
+            self._enter(slot, life, "static", known)
+            events.append((slot, "was moved: rests at a new place"))
+            return state_edits.place(state, slot, *elsewhere, moving=False)
+        if known.now - life.doubted > _DOUBTED_S and not life.told:
+            life.told = True
+            events.append((slot, f"ranges do not fit ({verdict.bias:+.1f} m): a clock, walls, or it was moved"))
+        return state
+
+    def _believes(self, found: np.ndarray | None, share: float, now: float, seen: list[Estimate]) -> bool:
+        """Whether the robot is believed to have been carried to another place that its ranges found: at once where the
+        scans do not fit the map either, else when most of the ranges say so for long."""
+        scores = [estimate.score for estimate in seen if not estimate.poor]
+        fitting = len(scores) > 0 and float(np.median(scores)) > _FITTING_SCORE
+        if found is None or (fitting and share <= _FOUND_SHARE):
+            self._contradicted = None
+            return False
+        self._contradicted = now if self._contradicted is None else self._contradicted
+        if fitting and now - self._contradicted < _CONTRADICTED_S:
+            return False
+        self._contradicted = None
+        return True
+
+    def _find_carried_robot(self, state: State, known: Known) -> tuple[float, np.ndarray | None]:
+        """Share of the resting beacons that the robot's ranges do not fit, and where the robot is by its ranges alone
+        when they say that it is not where the state has it."""
+        active = np.asarray(state.active)
+        rows, misfit = [], []
+        for slot, life in self._lives.items():
+            if not active[slot] or life.status != "static":
+                continue
+            recent = life.sightings.since(known.now - _CARRIED_S)
+            recent = recent[recent[:, OTHER] == 0]
+            if len(recent) < 2:
+                continue
+            misfit.append(statistics.median(np.abs(recent[:, NORMALISED]).tolist()) > _MISFIT)
+            rows.append(
+                np.column_stack([np.tile(known.places[slot], (len(recent), 1)), recent[:, DISTANCE]])[-_NEWEST:]
+            )
+        share = float(np.mean(misfit)) if len(misfit) >= 3 else 0.0
+        if share < _CARRIED_SHARE:
+            return share, None
+        anchors, distance = np.concatenate(rows)[:, :2], np.concatenate(rows)[:, 2]
+        # the newest ranges were taken on the move: a few decimetres are as good as they get
+        found = locate(anchors, distance, np.full(len(distance), 2 * self._sigma_n))
+        if found is None or np.linalg.norm(found[0] - known.places[0]) < _CARRIED_M:
+            return share, None
+        left = np.abs(np.linalg.norm(anchors - found[0], axis=1) - distance)
+        return share, found[0] if np.mean(left < _MISFIT * self._sigma_n) > _FOUND_SHARE else None

@@ -1,0 +1,258 @@
+"""What each command of the command line does: options, files, progress and figures. All printing is here.
+
+Every key of the settings is a flag of `run` (--uwb.sigma-n 0.1); a flag goes before the file given by --config.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import zipfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+from tqdm import tqdm
+from tyro.conf import Positional, arg
+
+from uwbslam_drivers.device import DriverError
+from uwbslam_drivers.emulators.command import EmulateOptions, emulate
+from uwbslam_jax.files import settings_file
+from uwbslam_jax.settings import ConfigError, Settings
+from uwbslam_jax.cli.finish_run import accuracy, deliver, table
+from uwbslam_jax.cli.live_command import LiveOptions, live
+from uwbslam_jax.files.log_summary import format_summary, inspect
+from uwbslam_jax.files.mcap_log import LogError, LogReader, LogWriter
+from uwbslam_jax.measurements import Message, ScanMessage, TruthMessage
+from uwbslam_jax.evaluation import Truth, evaluate
+from uwbslam_jax.files.run_folder import RunError, read_run
+from uwbslam_jax.tuning.rollout import RolloutError
+from uwbslam_jax.api import run_log
+from uwbslam_jax.sim.simulate import SCENARIOS, Scenario, scenario, settings_overrides, simulate
+from uwbslam_jax.cli.tune_command import TuneOptions, tune
+
+
+class UsageError(ValueError):
+    """A request that cannot be met; the message is one line."""
+
+
+USER_ERRORS = (LogError, ConfigError, RunError, RolloutError, DriverError, UsageError, OSError)
+"""What a user can mend; the command line tells these in one line. Anything else is a defect of ours."""
+
+
+@dataclass
+class RunOptions:
+    """Run a recording; its track, beacons, map, summary and report go into a folder."""
+
+    logs: Positional[tuple[Path, ...]]
+    """MCAP recording, or a ROS 2 bag folder; several MCAP files are one recording."""
+    out: Annotated[Path, arg(aliases=["-o"])]
+    """Folder for the files; it is created."""
+    config: Path | None = None
+    """Settings in TOML; flags go before it."""
+    no_odom: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Leave odometry out, short for --odom.no-use."""
+    lidar_only: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Leave the ranges out, short for --filter.lidar-only."""
+    online: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Step frame by frame as on the robot; the same result, more slowly."""
+    quiet: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """No progress bar."""
+    settings: Annotated[Settings, arg(name="")] = field(default_factory=Settings)
+
+
+@dataclass
+class DemoOptions:
+    """Simulate a robot in a workshop with five beacons, run the recording, and report how far off the answer is."""
+
+    seed: int = 0
+    """Another seed is another workshop."""
+    duration: float = 150.0
+    """Length of the recording [s]."""
+    out: Annotated[Path, arg(aliases=["-o"])] = Path("uwbslam-demo")
+    """Folder for the recording and the files of the run; it is created."""
+    quiet: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """No progress bars."""
+
+
+@dataclass
+class SimulateOptions:
+    """Write a recording of a ready-made scenario, with ground truth, and the settings that fit its robot, if any."""
+
+    name: Positional[str]
+    """The scenario."""
+    out: Annotated[Path, arg(aliases=["-o"])]
+    """The recording (.mcap); settings go beside it (.toml)."""
+    seed: int = 0
+    """Another seed is another world."""
+    duration: float | None = None
+    """Length of the recording [s]; the scenario's own where not given."""
+    quiet: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """No progress bar."""
+
+
+@dataclass
+class EvaluateOptions:
+    """Compare a run with ground truth, after one rigid motion that lays robot and beacons together over it."""
+
+    directory: Positional[Path]
+    """Folder that `uwbslam run` wrote."""
+    truth: Positional[Path]
+    """Recording (.mcap) with ground truth, or arrays t, robot, ids, beacons (.npz)."""
+
+
+@dataclass
+class InspectOptions:
+    """Tell what a recording holds: topics, rates, gaps, nodes heard, and what is missing."""
+
+    logs: Positional[tuple[Path, ...]]
+    """MCAP recording, or a ROS 2 bag folder; several MCAP files are one recording."""
+    config: Path | None = None
+    """Settings in TOML, for the topics and the robot's id."""
+
+
+def call(name: str, words: Sequence[str]) -> None:
+    """Runs one command with its own arguments.
+
+    Raises:
+      USER_ERRORS: see there. SystemExit: bad usage (status 2), or help was asked for (0); the text is printed.
+    """
+    options, run = _COMMANDS[name]
+    default = None
+    if options is RunOptions:
+        default = RunOptions((), Path(), settings=_settings_file(words))
+        default.logs = default.out = tyro.MISSING  # these two have to be given all the same
+    elif options is TuneOptions:
+        default = TuneOptions((), Path(), settings=_settings_file(words))
+        default.logs = default.out = tyro.MISSING
+    elif options is LiveOptions:
+        default = LiveOptions(Path(), settings=_settings_file(words))
+        default.out = tyro.MISSING
+    run(tyro.cli(options, args=list(words), default=default, prog=f"uwbslam {name}", description=options.__doc__))
+
+
+def _settings_file(words: Sequence[str]) -> Settings:
+    """The settings of the file given by --config: they are the defaults that the flags are read against."""
+    for k, word in enumerate(words):
+        if word == "--config" and k + 1 < len(words):
+            return settings_file.load(words[k + 1])
+        if word.startswith("--config="):
+            return settings_file.load(word.removeprefix("--config="))
+    return Settings()
+
+
+def run(options: RunOptions) -> None:
+    """The command `run`."""
+    settings = options.settings
+    if options.no_odom:
+        settings = dataclasses.replace(settings, odom=dataclasses.replace(settings.odom, use=False))
+    if options.lidar_only:
+        settings = dataclasses.replace(settings, filter=dataclasses.replace(settings.filter, lidar_only=True))
+    _run_and_write(options.logs, settings_file.check(settings), options.out, quiet=options.quiet, online=options.online)
+
+
+def demo(options: DemoOptions) -> None:
+    """The command `demo`."""
+    options.out.mkdir(parents=True, exist_ok=True)
+    made = _scenario("workshop", options.seed, options.duration)
+    log = options.out / "demo.mcap"
+    _record(made, log, options.quiet)
+    settings = settings_file.from_dict(settings_overrides(made))
+    _run_and_write((log,), settings, options.out, quiet=options.quiet, title="UWB and LiDAR SLAM demo")
+
+
+def simulate_scenario(options: SimulateOptions) -> None:
+    """The command `simulate`."""
+    made = _scenario(options.name, options.seed, options.duration)
+    _record(made, options.out, options.quiet)
+    print(f"recording: {options.out} ({made.duration:.1f} s)")
+    text = settings_file.differences(settings_file.from_dict(settings_overrides(made)))
+    if text:
+        path = options.out.with_suffix(".toml")
+        path.write_text(text, encoding="utf-8")
+        print(f"settings: {path}")
+
+
+def evaluate_run(options: EvaluateOptions) -> None:
+    """The command `evaluate`."""
+    found = read_run(options.directory)
+    beacons = dict(zip(found.beacon_ids.tolist(), found.beacons, strict=True))
+    figures = evaluate(found.stamps, found.poses, beacons, _load_truth(options.truth))
+    print(table(accuracy(figures)))
+
+
+def inspect_log(options: InspectOptions) -> None:
+    """The command `inspect`."""
+    s = settings_file.load(options.config) if options.config else Settings()
+    topics = {"scan_topic": s.lidar.topic, "uwb_topic": s.uwb.topic, "odom_topic": s.odom.topic}
+    print(format_summary(inspect(options.logs, **topics, robot_id=s.robot.id, max_range=s.uwb.max_range)))
+
+
+_COMMANDS: dict[str, tuple[Any, Callable[[Any], None]]] = {
+    "demo": (DemoOptions, demo),
+    "run": (RunOptions, run),
+    "simulate": (SimulateOptions, simulate_scenario),
+    "evaluate": (EvaluateOptions, evaluate_run),
+    "inspect": (InspectOptions, inspect_log),
+    "tune": (TuneOptions, tune),
+    "live": (LiveOptions, live),
+    "emulate": (EmulateOptions, emulate),
+}
+
+
+# What several commands share.
+
+
+def _run_and_write(
+    logs: tuple[Path, ...],
+    settings: Settings,
+    out: Path,
+    *,
+    quiet: bool,
+    online: bool = False,
+    title: str | None = None,
+) -> None:
+    """Runs a recording, writes every file of the run and prints its figures."""
+    out.mkdir(parents=True, exist_ok=True)  # before the long work, not after it
+    with tqdm(desc="run", unit="msg", leave=False, disable=True if quiet else None) as bar:
+
+        def progress(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        result, truth = run_log(logs, settings, online=online, progress=progress)
+    deliver(result, truth, out, title or f"UWB and LiDAR SLAM: {', '.join(log.name for log in logs)}")
+
+
+def _scenario(name: str, seed: int, duration: float | None) -> Scenario:
+    if name not in SCENARIOS:
+        raise UsageError(f"no scenario {name}; there are {', '.join(SCENARIOS)}")
+    if seed < 0:
+        raise UsageError(f"seed {seed}: must not be negative")
+    if duration is not None and not 0.0 < duration < 1e6:
+        raise UsageError(f"duration {duration:g} s: must be greater than 0")
+    return scenario(name, seed, duration)
+
+
+def _record(made: Scenario, path: Path, quiet: bool) -> None:
+    """Writes the messages of a scenario."""
+    scans = int(made.duration * made.lidar.rate)
+    bar = tqdm(desc="simulate", unit="scan", total=scans, leave=False, disable=True if quiet else None)
+    with LogWriter(path) as writer, bar:
+        for message in simulate(made):
+            writer.write(message)
+            bar.update(isinstance(message, ScanMessage))
+
+
+def _load_truth(path: Path) -> Truth:
+    """Ground truth of a recording or of an .npz file."""
+    try:
+        if path.suffix == ".npz":
+            return Truth.load(path)
+        messages: Iterator[Message] = iter(LogReader(path, scan_topic=None, uwb_topic=None, odom_topic=None))
+        return Truth.from_messages(m for m in messages if isinstance(m, TruthMessage))
+    except LogError:
+        raise
+    except (ValueError, zipfile.BadZipFile) as error:
+        raise UsageError(str(error) if str(path) in str(error) else f"{path}: {error}") from None

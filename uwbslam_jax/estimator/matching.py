@@ -1,0 +1,309 @@
+"""Aligning a scan with the map: Gauss-Newton coarse to fine, the score of a match, and the wide search."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import optimistix as optx
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, Bool, Float
+
+from uwbslam_jax.mapping import grid as occupancy
+from uwbslam_jax.numerics.gaussian import Gaussian, symmetric_root
+from uwbslam_jax.numerics.se2 import rotation, transform_points, wrap_angle
+from uwbslam_jax.mapping.grid import Grid, Sweep
+from uwbslam_jax.estimator.lidar_objective import lidar_gram, lidar_residual, prior_residual
+from uwbslam_jax.mapping.sweep import Surface
+
+_MOVES = (6, 5, 5)
+"""Gauss-Newton moves at the finest, middle and every coarser level, at most."""
+_STILL = 0.005
+"""A level is done when a move is shorter than this many of its cells [cells of m or rad]."""
+_NEARBY_BEAMS = 540
+"""A scan that is nearly in place needs no more beams than this: neighbours hit the same cell."""
+_NEARBY_MOVES, _NEARBY_STILL = 3, 0.02
+"""Nor more moves, and what its last is shorter than [cells of m or rad]."""
+_CHECKED_BEAMS = 360
+"""And more than this do not tell how well it fits where it was expected."""
+_BLIND = (0.006, 0.02)
+"""Share of normals in the least seen direction below which a scan is blind in it, and above which it is not."""
+_SEARCH_HEADINGS, _SEARCH_BEAMS, _SEARCH_REFINED = 120, 180, 8
+_UNLIKELY = 0.005
+"""What a squared Mahalanobis distance of one costs a searched place, in mean Gamma: as if 100 beams were independent.
+Headings cost little: the search is for a robot that turned."""
+_TURN = 1.0
+"""A turn that counts as a distance of one [rad]."""
+
+
+class Match(NamedTuple):
+    """A scan aligned with the map.
+
+    Attributes:
+      pose: (3,) the robot's pose in the map [m, m, rad].
+      information: (3, 3) Gram matrix of the residuals at that pose, unscaled (H^(LiD) of the paper).
+      informed: (2, 2) projector on the directions in which it tells the position.
+      score: mean Gamma of the returns that fall on observed cells; about 0.8 when right, 0.4 when not.
+      known: share of the returns that fall on observed cells.
+    """
+
+    pose: Float[Array, "3"]
+    information: Float[Array, "3 3"]
+    informed: Float[Array, "2 2"]
+    score: Float[Array, ""]
+    known: Float[Array, ""]
+
+
+class Blind(NamedTuple):
+    """The direction in which a scan cannot tell where it is: along a corridor whose ends are out of reach.
+
+    Attributes:
+      direction: (2,) unit vector in the robot's frame.
+      weight: 0 where the scan sees enough in every direction, 1 where it sees nothing in this one.
+    """
+
+    direction: Float[Array, "2"]
+    weight: Float[Array, ""]
+
+
+def blind_direction(surface: Surface, counted: Bool[Array, "B"]) -> Blind:
+    """From the scan alone: the least eigenvector of the mean n n^T of its surface normals (DESIGN 1.8).
+
+    The map cannot tell. The cells of a straight wall form a pattern along it, to which a scan locks: HectorSLAM
+    shortens corridors.
+
+    Args:
+      counted: beams that take part.
+    """
+    counted = counted & surface.found
+    tangent, count = jnp.where(counted, surface.tangent, 0.0), jnp.sum(counted)
+    # of tangents: the larger eigenvector of [[a, b], [b, c]] is where the walls run
+    T = tangent @ tangent.T / jnp.maximum(count, 1)
+    a, b, c = T[0, 0], T[0, 1], T[1, 1]
+    angle = 0.5 * jnp.arctan2(2 * b, a - c)
+    direction = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+    least = jnp.maximum(0.5 * (a + c - jnp.sqrt((a - c) ** 2 + 4 * b**2)), 0.0)
+    weight = jnp.clip((_BLIND[1] - least) / (_BLIND[1] - _BLIND[0]), 0.0, 1.0)
+    return Blind(direction, jnp.where(count > 20, weight, 0.0))
+
+
+def seen(blind: Blind, heading: Float[Array, ""]) -> Float[Array, "2 2"]:
+    """Projector on what the scan sees, in the frame of a heading."""
+    e = rotation(heading) @ blind.direction
+    return jnp.eye(2) - blind.weight * e[:, None] * e[None, :]
+
+
+def share_of_walls(
+    surface: Surface, some: Bool[Array, "B"], counted: Bool[Array, "B"], heading: Float[Array, ""]
+) -> Float[Array, "2 2"]:
+    """By how much each direction of a matched position is told by some of a scan's walls: G_all^-1 G_some of their
+    normals, in the frame of a heading. A match then is (1 - share) what the other walls say + share what these say.
+
+    Args:
+      some: beams on the walls asked about, a part of those `counted`.
+    """
+
+    def gram(beams):
+        t = jnp.where(beams & surface.found, surface.tangent, 0.0)
+        normal = jnp.stack([t[1], -t[0]])
+        return normal @ normal.T
+
+    R = rotation(heading)
+    few = _BLIND[0] * jnp.maximum(jnp.sum(counted), 1)
+    return R @ jnp.linalg.solve(gram(counted) + few * jnp.eye(2), gram(some & counted)) @ R.T
+
+
+class _LidarAndPrior(NamedTuple):
+    """What the residual of a match needs, at one level."""
+
+    level: Float[Array, "c c"]
+    origin: Float[Array, "2"]
+    size: Float[Array, ""]
+    points: Float[Array, "B 2"]
+    valid: Bool[Array, "B"]
+    mean: Float[Array, "3"]
+    root: Float[Array, "3 3"]
+    sigma_l: Float[Array, ""]
+    seen: Float[Array, "2 2"]
+
+
+def _residual(pose: Float[Array, "3"], a: _LidarAndPrior) -> Float[Array, "7"]:
+    # what the scan cannot see is left to the prior: the LiDAR block does not depend on it
+    held = a.mean[:2] + a.seen @ (pose[:2] - a.mean[:2])
+    lidar = lidar_residual(jnp.append(held, pose[2]), a.level, a.origin, a.size, a.points, a.valid) / a.sigma_l
+    return jnp.concatenate([lidar, prior_residual(pose, a.mean, a.root)])
+
+
+class _GaussNewton(optx.GaussNewton):
+    """Gauss-Newton that stops by the length of a move alone, and takes that move.
+
+    Optimistix also waits until no entry of the residual changes any more, which those of a Gram matrix's root never do:
+    where the pose is right they pass through zero. And it evaluates once more after the last move.
+    """
+
+    def __init__(self, still: float):
+        super().__init__(rtol=0.0, atol=still, linear_solver=lx.Normal(lx.Cholesky()))
+
+    def terminate(self, fn, y, args, options, state, tags):
+        move = state.descent_state.newton
+        return (state.num_steps > 0) & (jnp.max(jnp.abs(move)) < self.atol), state.result
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        return jnp.where(jnp.all(jnp.isfinite(state.y_eval)), state.y_eval, y), aux, {}
+
+
+def gauss_newton(residual, start, args, moves: int, still: float = 0.0):
+    """Least squares by `moves` Gauss-Newton moves of optimistix at most; never raises, returns the last iterate. A move
+    of which every coordinate is shorter than `still` is the last."""
+    adjoint = optx.RecursiveCheckpointAdjoint()
+    solver = _GaussNewton(still)
+    return optx.least_squares(residual, solver, start, args=args, max_steps=moves, throw=False, adjoint=adjoint).value
+
+
+def thinned(sweep: Sweep, most: int = _CHECKED_BEAMS) -> Sweep:
+    """Every so manieth beam, about as many as asked for."""
+    n = max(1, sweep.valid.shape[0] // most)
+    few = sweep._replace(points=sweep.points[::n], valid=sweep.valid[::n], reach=sweep.reach[::n])
+    return few._replace(bearing_step=n * sweep.bearing_step)
+
+
+def align(
+    grid: Grid,
+    sweep: Sweep,
+    blind: Blind,
+    start: Float[Array, "3"],
+    prior: Gaussian,
+    sigma_l: Float[Array, ""],
+    resolution: float,
+    near: bool | Bool[Array, ""] = False,
+) -> Float[Array, "3"]:
+    """Pose that minimises 1/2 sum (1 - Gamma)^2 / sigma_l^2 + the prior's quadratic, coarse to fine (DESIGN 1.4).
+
+    Args:
+      near: the start is within a cell of the answer: the coarser levels would only lead away from it and back, and
+        fewer beams will do.
+    """
+    root = solve_triangular(symmetric_root(prior.cov), jnp.eye(3, dtype=start.dtype), lower=True)
+    projector = seen(blind, start[2])
+
+    def at_level(k: int, beams: Sweep, pose, moves: int, still: float):
+        size = jnp.asarray(resolution * 2**k, pose.dtype)
+        # fewer beams weigh as much as all of them
+        weight = jnp.sqrt(jnp.asarray(beams.valid.shape[0] / sweep.valid.shape[0], pose.dtype))
+        scan = (grid.levels[k], grid.origin, size, beams.points, beams.valid)
+        args = _LidarAndPrior(*scan, prior.mean, root, sigma_l * weight, projector)
+        return gauss_newton(_residual, pose, args, moves, still * resolution * 2**k)
+
+    def from_nearby(pose):
+        return at_level(0, thinned(sweep, _NEARBY_BEAMS), pose, _NEARBY_MOVES, _NEARBY_STILL)
+
+    def from_afar(pose):
+        for k in reversed(range(len(grid.levels))):
+            pose = at_level(k, sweep, pose, _MOVES[min(k, 2)], _STILL)
+        return pose
+
+    return jax.lax.cond(near, from_nearby, from_afar, start)
+
+
+def assess(grid: Grid, sweep: Sweep, surface: Surface, pose: Float[Array, "3"], resolution: float) -> Match:
+    """Score and information of a pose against the finest level.
+
+    There is no information in the direction in which what the map has of the scan's walls is blind: the end of a
+    corridor tells nothing before it is drawn.
+    """
+    gram = lidar_gram(pose, grid.levels[0], grid.origin, resolution, sweep.points, sweep.valid)
+    score, known = fit(grid, sweep, pose, resolution)
+    ends = transform_points(pose, sweep.points)
+    on_wall, _ = on_known_wall(grid, ends, resolution, min(1, len(grid.levels) - 1))
+    informed = seen(blind_direction(surface, sweep.valid & on_wall), pose[2])
+    projector = jnp.eye(3).at[:2, :2].set(informed)
+    information = projector @ gram[:3, :3] @ projector
+    return Match(pose, information, informed, score, known)
+
+
+def fit(
+    grid: Grid, sweep: Sweep, pose: Float[Array, "3"], resolution: float
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Score and known share of a scan at a pose, see Match, against the finest level."""
+    ends = transform_points(pose, sweep.points)
+    corners, at, inside = occupancy.corner_log_odds(grid.levels[0], grid.origin, resolution, ends)
+    value, _ = occupancy.interpolate(jax.nn.sigmoid(corners), at, resolution)
+    observed = sweep.valid & inside & jnp.any(corners != 0, axis=(1, 2))
+    count = jnp.sum(observed)
+    score = jnp.sum(jnp.where(observed, value, 0.0)) / jnp.maximum(count, 1)
+    return score, count / jnp.maximum(jnp.sum(sweep.valid), 1)
+
+
+def on_known_wall(
+    grid: Grid, ends: Float[Array, "B 2"], resolution: float, level: int
+) -> tuple[Bool[Array, "B"], Bool[Array, "B"]]:
+    """Whether any of the four cells of a level around a place is a wall, and whether it is in the window."""
+    size = resolution * 2**level
+    corners, _, inside = occupancy.corner_log_odds(grid.levels[level], grid.origin, size, ends)
+    return inside & jnp.any(corners > 0, axis=(1, 2)), inside
+
+
+def search(
+    grid: Grid,
+    sweep: Sweep,
+    surface: Surface,
+    prior: Gaussian,
+    known: tuple[Float[Array, "3"], Float[Array, "3"]],
+    sigma_l: Float[Array, ""],
+    resolution: float,
+) -> Float[Array, "3"]:
+    """Best pose over the full circle of headings and two patches of positions (DESIGN 1.8): around the prior's mean,
+    and around the last pose, because a robot that turned has often driven less far than its velocity said.
+
+    Every heading and position is scored at the middle level; the best of each peak over the headings is aligned and
+    scored at the finest, where it has to be better than the pose that was found without searching.
+
+    Args:
+      prior: mean and covariance of the pose expected; its position weighs in the choice, its heading does not.
+      known: the last pose, and the pose found without searching.
+    """
+    last, found = known
+    blind = blind_direction(surface, sweep.valid)
+    k = min(1, len(grid.levels) - 1)
+    size = resolution * 2**k
+    stride = max(1, sweep.points.shape[0] // _SEARCH_BEAMS)
+    points, valid = sweep.points[::stride], sweep.valid[::stride]
+    spread = jnp.clip(1.5 * jnp.sqrt(jnp.maximum(prior.cov[0, 0], prior.cov[1, 1])), 0.05, 0.6)
+    axis = jnp.linspace(-1.0, 1.0, 5)
+    patch = jnp.stack(jnp.meshgrid(axis, axis), axis=-1).reshape(-1, 2) * spread
+    centres = jnp.stack([prior.mean[:2], last[:2]])
+    places = (centres[:, None] + patch[None]).reshape(-1, 2)
+    headings = prior.mean[2] + jnp.linspace(-jnp.pi, jnp.pi, _SEARCH_HEADINGS, endpoint=False)
+
+    def scores(heading):
+        c, s = jnp.cos(heading), jnp.sin(heading)
+        turned = jnp.stack([c * points[:, 0] - s * points[:, 1], s * points[:, 0] + c * points[:, 1]], axis=-1)
+        ends = (turned[None] + places[:, None]).reshape(-1, 2)
+        corners, at, inside = occupancy.corner_log_odds(grid.levels[k], grid.origin, size, ends)
+        value, _ = occupancy.interpolate(jax.nn.sigmoid(corners), at, size)
+        gain = jnp.where(inside, value - 0.5, 0.0).reshape(places.shape[0], -1)
+        return jnp.sum(jnp.where(valid, gain, 0.0), axis=1)
+
+    table = jax.lax.map(scores, headings, batch_size=8)  # (headings, places)
+    best_place = jnp.argmax(table, axis=1)
+    value = jnp.max(table, axis=1)
+    peak = (value >= jnp.roll(value, 1)) & (value >= jnp.roll(value, -1))
+    _, best = jax.lax.top_k(jnp.where(peak, value, -jnp.inf), _SEARCH_REFINED)
+    starts = jnp.concatenate([places[best_place[best]], headings[best, None]], axis=1)
+    starts = jnp.concatenate([found[None], starts])
+    information = jnp.linalg.inv(prior.cov[:2, :2])
+
+    def refine(start):
+        wide = Gaussian(start, jnp.diag(jnp.array([0.3, 0.3, 0.3]) ** 2))
+        pose = align(grid, sweep, blind, start, wide, sigma_l, resolution)
+        m = assess(grid, sweep, surface, pose, resolution)
+        away = pose[None, :2] - centres
+        turned = wrap_angle(pose[2] - jnp.stack([prior.mean[2], last[2]])) / _TURN
+        unlikely = jnp.min(jnp.sum((away @ information) * away, axis=1)) + jnp.min(turned**2)
+        return pose, (m.score - 0.5) * m.known - _UNLIKELY * unlikely
+
+    poses, values = jax.lax.map(refine, starts)
+    pose = poses[jnp.argmax(values)]
+    return pose.at[2].set(prior.mean[2] + wrap_angle(pose[2] - prior.mean[2]))

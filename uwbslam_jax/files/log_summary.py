@@ -1,0 +1,194 @@
+"""What a recording holds, for a person: topics with their rates and gaps, who was heard, what is missing."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass, field
+
+from uwbslam_jax.files.bag import Bag, Source
+from uwbslam_jax.files.mcap_log import choose_topics
+from uwbslam_jax.files.mcap_container import LogError
+from uwbslam_jax.measurements import Message, RangeMessage, ScanMessage
+from uwbslam_jax.files.schemas import Decoder, Options, Role
+
+
+@dataclass(frozen=True, slots=True)
+class TopicSummary:
+    """One topic of a recording.
+
+    Attributes:
+      name, schema: of the topic.
+      role: "scan", "uwb", "odom", "truth", None where it is not used.
+      count: messages.
+      rate: messages per second between its first and its last [Hz], NaN for fewer than two.
+      largest_gap: longest time between two of its messages, by log time [s], NaN for fewer than two.
+    """
+
+    name: str
+    schema: str
+    role: str | None
+    count: int
+    rate: float
+    largest_gap: float
+
+
+@dataclass(frozen=True, slots=True)
+class LogSummary:
+    """What a recording holds.
+
+    Attributes:
+      name: what it is called.
+      duration: from its first to its last message [s].
+      topics: every topic, by name.
+      ids: exchanges each node took part in, by id.
+      pairs: exchanges by pair of ids, the smaller first.
+      powers: whether the ranges report both powers.
+      odometry, ground_truth: whether there is any.
+      beams: most beams of a scan.
+      dropped: messages left out, by reason.
+      problems: what keeps the recording from being used, or is worth knowing; one line each.
+      truncated: where it breaks, None where it does not.
+    """
+
+    name: str
+    duration: float
+    topics: list[TopicSummary]
+    ids: dict[int, int]
+    pairs: dict[tuple[int, int], int]
+    powers: bool
+    odometry: bool
+    ground_truth: bool
+    beams: int
+    dropped: Counter[str]
+    problems: list[str]
+    truncated: str | None
+
+
+def inspect(
+    source: Source,
+    *,
+    scan_topic: str | None = "/scan",
+    uwb_topic: str | None = "/uwb/ranges",
+    odom_topic: str | None = "/odom",
+    robot_id: int = 0,
+    max_range: float = 200.0,
+) -> LogSummary:
+    """Reads a recording through and tells what it holds; arguments as for `LogReader`.
+
+    Raises:
+      LogError: the file cannot be read at all. Missing or ambiguous topics are `problems` of the summary.
+    """
+    recording, options = Bag(source), Options(robot_id, max_range)
+    decoders: dict[int, Decoder] = {}
+    roles: dict[int, Role] = {}
+    problems: list[str] = []
+    wanted: dict[Role, str | None] = {"scan": scan_topic, "uwb": uwb_topic, "odom": odom_topic}
+    for role, topic in wanted.items():
+        try:
+            new_decoders, new_roles = choose_topics(recording, {role: topic}, options)
+            decoders, roles = new_decoders | decoders, new_roles | roles
+            if role != "odom" and topic is not None and role not in new_roles.values():
+                problems.append(f"no {role} topic")
+        except LogError as error:
+            problems.append(str(error))
+    topic_of = {channel.id: channel.topic for channel in recording.channels.values()}
+    clocks = {topic: _Clock() for topic in topic_of.values()}
+    heard = _Heard()
+    for log_time, number, data in recording.records():
+        if number not in topic_of:
+            continue
+        clocks[topic_of[number]].tick(log_time)
+        if number in decoders:
+            heard.take(decoders[number](data, log_time))
+    return LogSummary(
+        name=recording.name,
+        duration=(recording.end - recording.start) * 1e-9,
+        topics=_topics(recording, clocks, roles),
+        ids=dict(sorted(heard.ids.items())),
+        pairs=dict(sorted(heard.pairs.items())),
+        powers=heard.powers,
+        odometry="odom" in roles.values(),
+        ground_truth="truth" in roles.values(),
+        beams=heard.beams,
+        dropped=options.dropped,
+        problems=problems,
+        truncated=recording.truncated,
+    )
+
+
+class _Clock:
+    """Count, first, last and largest gap of a topic's log times."""
+
+    def __init__(self) -> None:
+        self.count = self.first = self.last = self.gap = 0
+
+    def tick(self, log_time: int) -> None:
+        if self.count:
+            self.gap = max(self.gap, log_time - self.last)
+        else:
+            self.first = log_time
+        self.count, self.last = self.count + 1, log_time
+
+
+@dataclass
+class _Heard:
+    """What the messages said, gathered."""
+
+    ids: Counter[int] = field(default_factory=Counter)
+    pairs: Counter[tuple[int, int]] = field(default_factory=Counter)
+    powers: bool = False
+    beams: int = 0
+
+    def take(self, messages: list[Message]) -> None:
+        for message in messages:
+            if isinstance(message, RangeMessage):
+                pair = min(message.source, message.target), max(message.source, message.target)
+                self.pairs[pair] += 1
+                self.ids.update(pair)
+                self.powers = self.powers or not math.isnan(message.receive_power - message.first_path_power)
+            elif isinstance(message, ScanMessage):
+                self.beams = max(self.beams, message.ranges.size)
+
+
+def _topics(recording: Bag, clocks: dict[str, _Clock], roles: dict[int, Role]) -> list[TopicSummary]:
+    by_name = {channel.topic: channel for channel in recording.channels.values()}
+    role_of = {recording.channels[number].topic: role for number, role in roles.items()}
+    summaries = []
+    for name, clock in sorted(clocks.items()):
+        span = (clock.last - clock.first) * 1e-9
+        rate = (clock.count - 1) / span if span > 0 else math.nan
+        gap = clock.gap * 1e-9 if clock.count > 1 else math.nan
+        summaries.append(TopicSummary(name, by_name[name].schema, role_of.get(name), clock.count, rate, gap))
+    return summaries
+
+
+def format_summary(summary: LogSummary) -> str:
+    """The summary as text of several lines, units in the column heads."""
+    lines = [f"{summary.name}: {summary.duration:.1f} s"]
+    rows = [("topic", "role", "messages", "rate [Hz]", "largest gap [s]", "type")]
+    for topic in summary.topics:
+        rate, gap = ("-" if math.isnan(v) else f"{v:.2f}" for v in (topic.rate, topic.largest_gap))
+        rows.append((topic.name, topic.role or "-", str(topic.count), rate, gap, topic.schema))
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    for row in rows:
+        cells = [c.rjust(w) if 2 <= k <= 4 else c.ljust(w) for k, (c, w) in enumerate(zip(row, widths, strict=True))]
+        lines.append("  " + "  ".join(cells).rstrip())
+    if summary.beams:
+        lines.append(f"beams a scan: {summary.beams}")
+    if summary.pairs:
+        lines.append("nodes heard: " + ", ".join(f"{node} ({count})" for node, count in summary.ids.items()))
+        nodes = len(summary.ids)
+        lines.append(f"pairs heard: {len(summary.pairs)} of {nodes * (nodes - 1) // 2}: " + _pairs(summary.pairs))
+        lines.append(f"powers: {'reported' if summary.powers else 'not reported: NLOS by residuals only'}")
+    lines.append(f"odometry: {'yes' if summary.odometry else 'no'}")
+    lines.append(f"ground truth: {'yes' if summary.ground_truth else 'no'}")
+    lines += [f"dropped: {count} x {reason}" for reason, count in sorted(summary.dropped.items())]
+    lines += [f"problem: {problem}" for problem in summary.problems]
+    lines += [f"truncated: {summary.truncated}"] if summary.truncated else []
+    return "\n".join(lines)
+
+
+def _pairs(pairs: dict[tuple[int, int], int], most: int = 28) -> str:
+    shown = [f"{a}-{b} ({count})" for (a, b), count in list(pairs.items())[:most]]
+    return ", ".join(shown + ["..."] * (len(pairs) > most))

@@ -1,0 +1,213 @@
+"""Messages out of and into MCAP recordings: which topic plays which role, in what order, and what was left out.
+
+How a message type is laid out is `schemas`; how the file is built is `mcap_records`; frames are made in `frames`.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+
+from uwbslam_jax.files.bag import Bag, Source
+from uwbslam_jax.files.mcap_container import Channel, RecordWriter
+from uwbslam_jax.files.mcap_container import LogError as LogError
+from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, ScanMessage, TruthMessage
+from uwbslam_jax.files.ros_types import definition, encode
+from uwbslam_jax.files.schemas import Decoder, Options, Role, make_decoder, plausible
+
+TRUTH_ROBOT = "/ground_truth/robot"
+TRUTH_BEACON = "/ground_truth/beacon/"
+_KEYS: dict[Role, str] = {"scan": "lidar.topic", "uwb": "uwb.topic", "odom": "odom.topic"}  # as in the settings
+
+
+class LogReader:
+    """Iterates over the measurements of a recording by log time, streaming; may be iterated again.
+
+    Attributes:
+      name: what messages call it.
+      topics: topic -> role ("scan", "uwb", "odom", "truth") of the topics used.
+      warnings: what a user should know before the run, one line each.
+      dropped: messages left out so far, by reason; of the current iteration.
+      truncated: where the recording breaks, None where it does not; a corrupt chunk shows only while iterating.
+      message_count: messages on the topics used, whole and not yet decoded; for a progress bar.
+      duration: from the first to the last message of the file [s].
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        *,
+        scan_topic: str | None = "/scan",
+        uwb_topic: str | None = "/uwb/ranges",
+        odom_topic: str | None = "/odom",
+        robot_id: int = 0,
+        max_range: float = 200.0,
+    ):
+        """Opens a recording and chooses its topics: those named, else the only one of a fitting type.
+
+        Args:
+          source: an MCAP file, a ROS 2 bag folder, or several that belong together.
+          scan_topic, uwb_topic, odom_topic: where to look first; None leaves that sensor out.
+          robot_id: id of the robot's node, for range messages that name only the other one.
+          max_range: longer ranges are dropped and counted [m].
+
+        Raises:
+          LogError: the file cannot be read, has neither scans nor odometry nor ranges, leaves a choice open, or a named
+            topic holds something else.
+        """
+        self._recording = Bag(source)
+        self._options = Options(robot_id, max_range)
+        self.name = self._recording.name
+        wanted: dict[Role, str | None] = {"scan": scan_topic, "uwb": uwb_topic, "odom": odom_topic}
+        try:
+            self._decoders, self._roles = choose_topics(self._recording, wanted, self._options)
+            if scan_topic is not None and not {"scan", "uwb", "odom"} & set(self._roles.values()):
+                wanted_scan = f"{scan_topic} or any LaserScan"
+                raise LogError(f"no scan topic ({wanted_scan}), no odometry and no ranges; {_listing(self._recording)}")
+        except LogError as error:
+            broken = f"; {self._recording.truncated}" if self._recording.truncated else ""
+            raise LogError(f"{self.name}: {' '.join(str(error).split())}{broken}") from None
+        channels = self._recording.channels
+        self.topics: dict[str, Role] = {channels[number].topic: role for number, role in self._roles.items()}
+        self.warnings: list[str] = []
+        if uwb_topic is not None and "uwb" not in self._roles.values():
+            self.warnings.append(f"no UWB topic: {'LiDAR' if 'scan' in self._roles.values() else 'odometry'} only")
+        self.duration = (self._recording.end - self._recording.start) * 1e-9
+        counts = self._recording.counts
+        self.message_count = sum(counts[number] for number in self._roles)
+
+    @property
+    def dropped(self) -> Counter[str]:
+        return self._options.dropped
+
+    @property
+    def truncated(self) -> str | None:
+        return self._recording.truncated
+
+    def __iter__(self) -> Iterator[Message]:
+        self._options.dropped.clear()
+        for log_time, channel, data in self._recording.records(set(self._decoders)):
+            yield from self._decoders[channel](data, log_time)
+
+
+def choose_topics(
+    recording: Bag, wanted: dict[Role, str | None], options: Options
+) -> tuple[dict[int, Decoder], dict[int, Role]]:
+    """Decoders and roles by channel number: of the topic wanted for each role, else of the only one that fits.
+
+    Raises:
+      LogError: several topics fit, or a topic wanted by name holds something else.
+    """
+    decoders: dict[int, Decoder] = {}
+    roles: dict[int, Role] = {}
+    for role, topic in wanted.items():
+        if topic is None:
+            continue
+        chosen = [channel for channel in recording.channels.values() if channel.topic == topic]
+        if chosen:
+            found = {channel.id: make_decoder(channel, role, options) for channel in chosen}
+        else:
+            found = _discover(recording, role, options)
+        decoders |= found
+        roles |= dict.fromkeys(found, role)
+    for channel in recording.channels.values():
+        if channel.id not in decoders and (decoder := _truth_decoder(channel, options)) is not None:
+            decoders[channel.id], roles[channel.id] = decoder, "truth"
+    return decoders, roles
+
+
+def _discover(recording: Bag, role: Role, options: Options) -> dict[int, Decoder]:
+    """The channels of the only topic whose type fits the role; empty where none does. Raises LogError for several."""
+    found: dict[int, Decoder] = {}
+    for channel in recording.channels.values():
+        if plausible(channel, role) and not channel.topic.startswith("/ground_truth"):
+            try:
+                found[channel.id] = make_decoder(channel, role, options)
+            except LogError:
+                continue  # the name fits, the content does not: not a candidate
+    spoken = {number: decoder for number, decoder in found.items() if recording.counts[number]}
+    found = spoken or found  # a topic without a message is no rival to one with
+    topics = sorted({recording.channels[number].topic for number in found})
+    if len(topics) > 1:
+        raise LogError(f"several {role} topics: {', '.join(topics)}; choose with --{_KEYS[role]} TOPIC")
+    return found
+
+
+def _truth_decoder(channel: Channel, options: Options) -> Decoder | None:
+    """Decoder of a ground truth topic, None for any other topic or where it cannot be read."""
+    match = re.fullmatch(re.escape(TRUTH_BEACON) + r"(\d+)", channel.topic)
+    if match is None and channel.topic != TRUTH_ROBOT:
+        return None
+    try:
+        decode = make_decoder(channel, "truth", options)
+    except LogError:
+        return None
+    if match is None:
+        return decode
+    node = int(match[1])
+
+    def decode_beacon(data: bytes, log_time: int) -> list[Message]:
+        return [TruthMessage(m.stamp, node, m.x, m.y) for m in decode(data, log_time) if isinstance(m, TruthMessage)]
+
+    return decode_beacon
+
+
+def _listing(recording: Bag) -> str:
+    topics = sorted({f"{channel.topic} ({channel.schema})" for channel in recording.channels.values()})
+    return f"the topics are {', '.join(topics)}" if topics else "there are no topics"
+
+
+class LogWriter:
+    """Writes measurements as a ROS 2 recording; a context manager that always finishes the file."""
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        scan_topic: str = "/scan",
+        uwb_topic: str = "/uwb/ranges",
+        odom_topic: str = "/odom",
+    ):
+        """Opens the file, replacing one that is there. Raises LogError."""
+        self._records = RecordWriter(path)
+        self._topics = {"scan": scan_topic, "uwb": uwb_topic, "odom": odom_topic}
+        self._channels: dict[str, int] = {}
+
+    def write(self, message: Message, log_time: int | None = None, topic: str | None = None) -> None:
+        """Writes one measurement; log_time [ns] is its stamp and topic that of its kind where not given.
+
+        Raises:
+          LogError: a stamp that cannot be written.
+        """
+        topic = topic or self._topic(message)
+        try:
+            schema, data = encode(message)
+            if topic not in self._channels:
+                self._channels[topic] = self._records.add_topic(topic, schema, definition(schema))
+            self._records.write(self._channels[topic], data, message.stamp if log_time is None else log_time)
+        except struct.error as error:
+            raise LogError(f"{self._records.path}: {type(message).__name__} cannot be written: {error}") from None
+
+    def _topic(self, message: Message) -> str:
+        if isinstance(message, TruthMessage):
+            return TRUTH_ROBOT if message.node is None else f"{TRUTH_BEACON}{message.node}"
+        kind = {ScanMessage: "scan", RangeMessage: "uwb", OdometryMessage: "odom"}[type(message)]
+        return self._topics[kind]
+
+    def flush(self) -> None:
+        """Hands all messages so far to the operating system."""
+        self._records.flush()
+
+    def close(self) -> None:
+        """Finishes the file; a second call does nothing."""
+        self._records.close()
+
+    def __enter__(self) -> LogWriter:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None):
+        self.close()

@@ -1,0 +1,264 @@
+"""A live run: devices -> inbox -> session -> recording, view, publisher and, at the end, a Result. Prints nothing.
+
+Devices and recorder have threads of their own; one loop takes messages in the order of their arrival and steps.
+"""
+
+from __future__ import annotations
+
+import gc
+import sys
+import threading
+import time
+from array import array
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from uwbslam_drivers import Source, open_source
+from uwbslam_drivers.clock import host_time
+from uwbslam_jax import process
+from uwbslam_jax.session import saved_state
+from uwbslam_jax.settings import Settings
+from uwbslam_jax.session.result_builder import Facts
+from uwbslam_jax.live.message_queue import Arrival, Inbox
+from uwbslam_jax.web.live_page import LivePage, Status
+from uwbslam_jax.measurements import ScanMessage, StampedFrame
+from uwbslam_jax.live.publisher import Publisher
+from uwbslam_jax.live.recorder import LogRecorder
+from uwbslam_jax.result import Result
+from uwbslam_jax.files.ros_types import recorded
+from uwbslam_jax.api import CompileClock, Runner
+from uwbslam_jax.session.saved_state import Locator, Saved
+from uwbslam_jax.estimator.step import Estimate
+
+_IDLE_S = 0.05
+_STATUS_S = 0.5
+_SAVE_S = 10.0
+_RECENT = 400
+"""Latencies that the figures on the page are of."""
+_SWITCH_S = 0.5e-3
+"""A thread that waits for the interpreter gets it after so long: with 5 ms, three threads cost a scan's period."""
+_NO_LOSS = {"measurements", "bytes", "connections"}
+"""What devices count that is no measurement lost."""
+
+
+class Devices:
+    """Sources by name, each in a thread of its own.
+
+    Attributes:
+      defect: an error that no device explains; the run ends with it.
+    """
+
+    def __init__(self, lidar: str, uwb: Sequence[str]):
+        """Reads the URLs; nothing is opened yet. Raises DriverError."""
+        names = ["uwb"] if len(uwb) == 1 else [f"uwb {k + 1}" for k in range(len(uwb))]
+        self.sources: dict[str, Source] = {"lidar": open_source(lidar, "lidar")}
+        self.sources |= {name: open_source(url, "uwb") for name, url in zip(names, uwb, strict=True)}
+        self.defect: BaseException | None = None
+        self._threads: list[threading.Thread] = []
+
+    def start(self, inbox: Inbox) -> None:
+        """From now on, measurements go into an inbox."""
+        for name, source in self.sources.items():
+            self._threads.append(threading.Thread(target=self._read, args=(source, inbox), name=name, daemon=True))
+            self._threads[-1].start()
+
+    def _read(self, source: Source, inbox: Inbox) -> None:
+        try:
+            for reading in source:
+                inbox.put(recorded(reading.message), reading.received)
+        except Exception as error:
+            self.defect = error
+
+    def close(self) -> None:
+        for source in self.sources.values():
+            source.close()
+        for thread in self._threads:
+            thread.join()
+
+    def counts(self) -> dict[str, dict[str, int]]:
+        """What each device counted, and where it is."""
+        return {name: dict(sorted(source.counts.items())) for name, source in self.sources.items()}
+
+    def troubles(self) -> list[str]:
+        """Devices that do not deliver, one line each."""
+        return [
+            f"{name} ({source.address.url}) is {source.status}{': ' if source.failure else ''}{source.failure}"
+            for name, source in self.sources.items()
+            if source.status != "streaming"
+        ]
+
+
+class LiveRun:
+    """One live run; `run` it once.
+
+    Attributes:
+      recording: path of the MCAP file.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        devices: Devices,
+        recording: Path,
+        *,
+        page: LivePage | None = None,
+        publisher: Publisher | None = None,
+        saved: Saved | None = None,
+        fixed: bool = False,
+    ):
+        """Opens the recording.
+
+        Args:
+          page, publisher: who is told of each step.
+          saved: go on from this; fixed: and only localise.
+
+        Raises:
+          LogError: the recording cannot be opened.
+        """
+        self.recording = recording
+        self._settings, self._devices, self._page, self._publisher = settings, devices, page, publisher
+        self._saved, self._fixed = saved, fixed
+        self._locator = Locator(saved, settings) if saved is not None else None
+        self._recorder = LogRecorder(recording, settings)
+        self._inbox = Inbox(self._recorder.record)
+        self._recorder.tick = lambda: self._inbox.thin(host_time())
+        self._clock = CompileClock()
+        self._runner = Runner(settings, self._clock, online=True)
+        self._runner.session.listener = self._publish
+        self._scan_received: int | None = None
+        self._latency_ms = array("f")
+        self._not_located: Counter[str] = Counter()
+        self._beams: set[int] = set()
+        self._status, self._status_at = Status(), 0.0
+        self._measured: dict[str, int] = {}
+        self._saver: threading.Thread | None = None
+        self._saved_at = float("-inf")  # the first time as soon as there is something to save
+
+    def run(self, go: Callable[[], bool]) -> Result:
+        """Runs for as long as `go` says, which is asked between two messages. Raises what a device's driver raised."""
+        begin = time.perf_counter()
+        interval = sys.getswitchinterval()
+        sys.setswitchinterval(_SWITCH_S)
+        gc.collect()
+        gc.freeze()  # what is there by now stays: no pause to look through it again
+        try:
+            with self._clock:
+                self._devices.start(self._inbox)
+                while go() and self._devices.defect is None:
+                    self._turn(_IDLE_S)
+                self._devices.close()
+                while self._turn(0.0):
+                    pass
+                self._runner.finish()
+        finally:
+            self._devices.close()
+            self._recorder.close()
+            gc.unfreeze()
+            sys.setswitchinterval(interval)
+        if self._devices.defect is not None:
+            raise self._devices.defect
+        self._save(wait=True)
+        return self._result(time.perf_counter() - begin)
+
+    def _turn(self, timeout: float) -> bool:
+        """One message, if there is one within a time [s]."""
+        arrival = self._inbox.take(host_time(), timeout)
+        if time.monotonic() - self._status_at > _STATUS_S:
+            self._refresh()
+        if arrival is None:
+            return False
+        if isinstance(arrival.message, ScanMessage):
+            self._scan_received = arrival.received
+            self._beams.add(arrival.message.ranges.size)
+        if self._locator is None or self._located(self._locator, arrival):
+            self._runner.add(arrival.message)
+        else:
+            self._not_located["message: before the robot was located"] += 1
+        return True
+
+    def _located(self, locator: Locator, arrival: Arrival) -> bool:
+        """Whether the robot was found among the saved beacons; starts the session there once it is."""
+        place = locator.hear(arrival.log_time, arrival.message)
+        if place is not None and self._saved is not None:
+            self._runner.know(self._saved.slots)
+            saved_state.go_on(self._runner.session, self._saved, place, arrival.message.stamp, fixed=self._fixed)
+            self._locator = None
+        return False
+
+    def _publish(self, frame: StampedFrame, estimate: Estimate) -> None:
+        """Called with each estimate, before the host looks at what it means for start-up and beacons."""
+        session = self._runner.session
+        if self._publisher is not None:
+            self._publisher.step(session, frame, estimate)
+        if self._page is not None:
+            self._page.step(session, frame, estimate, self._status)
+        if frame.frame.has_scan and self._scan_received is not None:
+            self._latency_ms.append((host_time() - self._scan_received) / 1e6)
+
+    def _refresh(self) -> None:
+        """Figures for the page, and the state for a later run, now and then."""
+        now = time.monotonic()
+        since, self._status_at = now - self._status_at, now
+        measured = {name: source.counts["measurements"] for name, source in self._devices.sources.items()}
+        rates = {name: (count - self._measured.get(name, count)) / since for name, count in measured.items()}
+        self._measured = measured
+        recent = np.array(self._latency_ms[-_RECENT:])
+        latency = (float(np.median(recent)), float(np.percentile(recent, 99))) if len(recent) else None
+        troubles = self._devices.troubles()
+        troubles += [f"recording: {self._recorder.failure}"] if self._recorder.failure else []
+        self._status = Status(rates, dict(self._dropped()), latency, troubles)
+        if now - self._saved_at > _SAVE_S and self._save(wait=False):
+            self._saved_at = now
+
+    def _save(self, *, wait: bool) -> bool:
+        """Writes the state in a thread, which may be waited for. False where there is nothing to save, before the frame
+        is decided, or the last one is still being written."""
+        session = self._runner.session
+        if self._saver is not None and (wait or not self._saver.is_alive()):
+            self._saver.join()
+            self._saver = None
+        known = session.decided_at is not None or session.settings.filter.lidar_only
+        if self._fixed or self._locator is not None or not known or self._saver is not None:
+            return False
+        self._saver = threading.Thread(target=self._write_state, args=(saved_state.snapshot(session),), daemon=True)
+        self._saver.start()
+        if wait:
+            self._saver.join()
+        return True
+
+    def _write_state(self, saved: Saved) -> None:
+        try:
+            saved_state.save(saved, self.recording.parent)
+        except OSError as error:  # a full disk must not end the run
+            self._recorder.failure = self._recorder.failure or f"{saved_state.FILE}: {error.strerror or error}"
+        process.give_back()
+
+    def _dropped(self) -> Counter[str]:
+        counts: Counter[str] = self._inbox.dropped + self._not_located
+        for source in self._devices.sources.values():
+            counts.update({why: n for why, n in source.counts.items() if why not in _NO_LOSS})
+        return counts
+
+    def _result(self, wall_s: float) -> Result:
+        warnings = [f"recording: {self._recorder.failure}"] if self._recorder.failure else []
+        most = self._settings.lidar.max_beams
+        if self._beams and max(self._beams) != most:
+            warnings.append(
+                f"scans have {max(self._beams)} beams, there was room for {most}: with --lidar.max-beams "
+                f"{max(self._beams)} steps are faster and the recording gives the same bits again"
+            )
+        facts = Facts(warnings, self._dropped(), compile_s=self._clock.seconds, wall_s=wall_s)
+        result = self._runner.result(facts)
+        latency = np.array(self._latency_ms)
+        if len(latency) == len(result.stamps):
+            result.diagnostics["latency_ms"] = latency
+        result.summary |= {
+            "latency_ms_median": float(np.median(latency)) if len(latency) else None,
+            "latency_ms_p99": float(np.percentile(latency, 99)) if len(latency) else None,
+            "recording": self.recording.name,
+            "devices": self._devices.counts(),
+        }
+        return result

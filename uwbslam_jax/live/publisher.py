@@ -1,0 +1,86 @@
+"""A live run as ROS 2 messages over a Foxglove WebSocket, for Foxglove and Lichtblick, without ROS.
+
+The messages are those of result.mcap. Needs foxglove-sdk, the extra `live`.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+
+from uwbslam_drivers.device import DriverError
+from uwbslam_jax.files import result_log
+from uwbslam_jax.files import ros_types
+from uwbslam_jax.measurements import StampedFrame
+from uwbslam_jax.result import BeaconEstimate
+from uwbslam_jax.session.session import Session
+from uwbslam_jax.estimator.step import Estimate
+
+BEACONS_S = 1.0
+MAP_S = 5.0
+
+
+class Publisher:
+    """Publishes poses and transforms of each step, beacons and map now and then.
+
+    Attributes:
+      url: where.
+    """
+
+    def __init__(self, host: str, port: int):
+        """Opens the port; 0 for any that is free. Raises DriverError where it cannot, or the package is not there."""
+        try:
+            import foxglove
+        except ImportError:
+            raise DriverError("--publish needs foxglove-sdk: pip install 'uwbslam_jax[live]'") from None
+        self._foxglove: Any = foxglove
+        self._context = foxglove.Context()
+        try:
+            self._server = foxglove.start_server(name="uwbslam", host=host, port=port, context=self._context)
+        except (RuntimeError, OSError, ValueError) as error:
+            raise DriverError(f"publishing at {host}:{port}: {error}") from None
+        self.url = f"ws://{host}:{self._server.port}"
+        self._channels: dict[str, Any] = {}
+        self._told_at = self._map_at = 0.0
+
+    def step(self, session: Session, frame: StampedFrame, estimate: Estimate) -> None:
+        """Takes in one step; called by the loop."""
+        stamp, now = frame.stamp, time.monotonic()
+        x, y, yaw = np.asarray(estimate.pose, float).tolist()
+        self._log(
+            "/pose", result_log.pose_with_covariance(stamp, x, y, yaw, np.asarray(estimate.pose_cov, float)), stamp
+        )
+        self._log("/tf", result_log.robot_transform(stamp, x, y, yaw), stamp)
+        if now - self._told_at > BEACONS_S:
+            self._told_at = now
+            self._log("/beacons", result_log.beacon_markers(stamp, _beacons(session, estimate)), stamp)
+        if now - self._map_at > MAP_S and session.state.scans_drawn > 0:
+            self._map_at = now
+            self._log("/map", result_log.occupancy(session.tiles.image(session.state.grid), stamp), stamp)
+
+    def close(self) -> None:
+        """Ends all connections."""
+        self._server.stop()
+
+    def _log(self, topic: str, message: tuple[str, bytes], stamp: int) -> None:
+        name, data = message
+        if topic not in self._channels:
+            schema = self._foxglove.Schema(name=name, encoding="ros2msg", data=ros_types.definition(name))
+            channel = self._foxglove.Channel(topic, schema=schema, message_encoding="cdr", context=self._context)
+            self._channels[topic] = channel
+        self._channels[topic].log(data, log_time=stamp)
+
+
+def _beacons(session: Session, estimate: Estimate) -> list[BeaconEstimate]:
+    placed = [(node, slot) for node, slot in session.slots.items() if slot and estimate.active[slot]]
+    return [
+        BeaconEstimate(
+            node,
+            np.asarray(estimate.beacons[slot], float),
+            np.asarray(estimate.beacon_covs[slot], float),
+            session.beacon_status(slot),
+        )
+        for node, slot in placed
+    ]

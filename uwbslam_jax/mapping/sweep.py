@@ -1,0 +1,87 @@
+"""The surfaces that a scan meets: which way they run, and what stands in for beams without a return."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from uwbslam_jax.mapping.grid import Sweep
+
+_NEIGHBOURS = (1, 2, 4, 8, 16)
+_GAPS = (1, 2, 4, 8, 16)
+"""A gap is closed from either side in such strides: up to 31 beams of it [beams]."""
+_NORMAL_SPAN = (0.25, 1.0)
+"""A normal needs neighbours this far apart [m]."""
+
+
+class Surface(NamedTuple):
+    """Where the beams of a scan meet surfaces whose direction can be told.
+
+    Attributes:
+      tangent: (2, B) unit vectors along the surface in the robot's frame, 0 where there is none.
+      found: (B,) whether there is one.
+    """
+
+    tangent: Float[Array, "2 B"]
+    found: Bool[Array, "B"]
+
+
+def surface(sweep: Sweep) -> Surface:
+    """Surface directions from two neighbours of a beam that are far enough apart for range noise not to matter, one on
+    either side, with the next return in place of one that is missing. Where the three are not on one line there is no
+    surface.
+    """
+    # what is seen is a decision, held when the step is differentiated
+    points, valid = jax.lax.stop_gradient(sweep.points), sweep.valid
+    beams, most = valid.shape[0], _NEIGHBOURS[-1]
+    own = points.T
+    (before, before_valid), (after, after_valid) = (_continued(own, valid, way) for way in (1, -1))
+    pad = ((0, 0), (most, most))
+    before, after = jnp.pad(before, pad), jnp.pad(after, pad)
+    before_valid, after_valid, wide_valid = (jnp.pad(a, most) for a in (before_valid, after_valid, valid))
+
+    def shifted(a, k):
+        return a[..., most + k : most + k + beams]
+
+    tangent, found = jnp.zeros_like(own), jnp.zeros_like(valid)
+    for k in _NEIGHBOURS:
+        a, b = shifted(before, -k), shifted(after, k)
+        (dx, dy), (x, y) = b - a, own - a
+        span = jnp.sqrt(dx**2 + dy**2)
+        scale = 1.0 / jnp.maximum(span, 1e-6)
+        share = (dx * x + dy * y) * scale**2
+        off = jnp.abs(dx * y - dy * x) * scale
+        ok = valid & shifted(before_valid, -k) & shifted(after_valid, k) & ~found
+        ok = ok & (span > _NORMAL_SPAN[0]) & (span < _NORMAL_SPAN[1])
+        tolerance = 0.025 + 0.05 * span
+        # where neither is a stand-in, they are also as far to either side: no wall seen at a grazing angle, whose
+        # direction a step in it would turn
+        own_two = shifted(wide_valid, -k) & shifted(wide_valid, k)
+        uneven = jnp.where(own_two, jnp.sqrt(jnp.maximum(tolerance**2 - off**2, 0.0)), 0.4 * span)
+        even = jnp.abs(share - 0.5) * span < uneven
+        ok = ok & even & (off < tolerance)
+        tangent = jnp.where(ok[None], jnp.stack([dx * scale, dy * scale]), tangent)
+        found = found | ok
+    return Surface(tangent, found)
+
+
+def stand_ins(valid: Bool[Array, "B"]) -> tuple[Int[Array, "B"], Bool[Array, "B"]]:
+    """For each beam itself, or where it has no return the nearest one that has; and whether there is one in reach."""
+    own = jnp.arange(valid.shape[0])
+    ((before,), has_before), ((after,), has_after) = (_continued(own[None], valid, way) for way in (1, -1))
+    nearer = has_before & (~has_after | (own - before <= after - own))
+    return jnp.where(nearer, before, after), has_before | has_after
+
+
+def _continued(values, valid, way):
+    """Values (n, B) with the last valid one carried on into gaps, towards higher beams (way 1) or lower (way -1), and
+    where they are valid then."""
+    for stride in (stride for stride in _GAPS if stride < valid.shape[0]):
+        values = jnp.where(valid[None], values, jnp.roll(values, way * stride, axis=-1))
+        none = jnp.zeros(stride, bool)
+        moved = jnp.append(none, valid[:-stride]) if way > 0 else jnp.append(valid[stride:], none)
+        valid = valid | moved
+    return values, valid

@@ -1,0 +1,262 @@
+"""Host messages to frames: what arrived between two scans becomes one padded set of measurements.
+
+The assembler closes a frame when a scan arrives (ranges and odometry up to its stamp belong to it). While no scan comes
+the odometry's stamps make the frames, and where there is no odometry either, ranges that have waited long enough. It
+gives every node id a slot, checks stamps and counts what it drops.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from uwbslam_jax.settings import Settings
+from uwbslam_jax.measurements import Frame, Message, Odometry, OdometryMessage, RangeMessage, Ranges, Scan, ScanMessage, StampedFrame, TruthMessage
+
+_SCANLESS_S = 1.0
+"""Ranges wait this long for a scan before they make a frame of their own."""
+_BLIND_S = 0.2
+_BLIND_SCANS = 2
+"""Once a LiDAR has fallen silent they wait only so long, or so many of its usual intervals where those are longer: no
+velocity predicts a turning robot for a second, but a slow scanner is not a silent one."""
+_INTERVALS = 9
+"""So many intervals between scans tell the usual one."""
+_WITHOUT_SCAN_S = 3.0
+"""After so long without a scan the odometry makes the frames."""
+_ODOMETRY_EVERY_S = 0.08
+"""Frames made by the odometry are at least so far apart."""
+_ODOMETRY_LAGS_S = 15.0
+"""Ranges wait this long for odometry that has come before."""
+_ODOMETRY_HOLD_S = 0.3
+"""The last odometry is extrapolated at most this far."""
+
+
+class FrameAssembler:
+    """Turns messages, in recording order, into frames.
+
+    Attributes:
+      slots: node id -> slot, the robot 0; filled as ids are heard.
+      dropped: what was not used, by reason.
+      warnings: one line each; that there are more beacons than slots is told once.
+      odometry_used: whether any frame carried an increment.
+    """
+
+    def __init__(self, settings: Settings, max_ranges: int):
+        self.slots: dict[int, int] = {settings.robot.id: 0}
+        self.dropped: Counter[str] = Counter()
+        self.warnings: list[str] = []
+        self.odometry_used = False
+        self._settings = settings
+        self._max_ranges = max_ranges
+        self._ranges: list[RangeMessage] = []
+        self._newest_range: dict[tuple[int, int], int] = {}
+        self._odometry: list[OdometryMessage] = []
+        self._last: int | None = None
+        self._scan_at: int | None = None
+        self._wait_s = _SCANLESS_S
+        self._intervals: deque[int] = deque(maxlen=_INTERVALS)  # between scans [ns]
+
+    def frames(self, messages: Iterable[Message]) -> Iterator[StampedFrame]:
+        """Frames of a whole stream of messages."""
+        for message in messages:
+            yield from self.add(message)
+        yield from self.flush()
+
+    def add(self, message: Message) -> list[StampedFrame]:
+        """Frames that a message completes: none, a scan's, or those of odometry and ranges that waited too long."""
+        match message:
+            case ScanMessage():
+                return self._add_scan(message)
+            case RangeMessage():
+                return self._add_range(message)
+            case OdometryMessage():
+                return self._add_odometry(message)
+            case TruthMessage():
+                pass
+        return []
+
+    def flush(self) -> list[StampedFrame]:
+        """Frames of the ranges and the odometry that no scan came for, at the end of a stream."""
+        frames = self._by_odometry(self._odometry[-1].stamp + 1) if self._odometry else []
+        return frames + (self._without_scan(before=None) if self._ranges else [])
+
+    def _add_scan(self, scan: ScanMessage) -> list[StampedFrame]:
+        if self._scan_at is not None and scan.stamp > self._scan_at:
+            self._intervals.append(scan.stamp - self._scan_at)
+        self._scan_at = max(scan.stamp, self._scan_at or scan.stamp)
+        if self._last is not None and scan.stamp <= self._last:
+            self.dropped["scan: stamp not after the one before"] += 1
+            return []
+        if scan.ranges.size < 2 or not np.isfinite([scan.angle_min, scan.angle_increment]).all():
+            self.dropped["scan: no beams or no bearings"] += 1
+            return []
+        waiting = self._without_scan(before=scan.stamp)
+        self._wait_s = _SCANLESS_S
+        late = [m for m in self._ranges if m.stamp > scan.stamp]
+        ready = [m for m in self._ranges if m.stamp <= scan.stamp]
+        self._ranges = late
+        return [*waiting, self._close(scan.stamp, ready, scan)]
+
+    def _add_range(self, message: RangeMessage) -> list[StampedFrame]:
+        if not (np.isfinite(message.range) and 0.0 < message.range <= self._settings.uwb.max_range):
+            self.dropped["range: not finite, not positive or too long"] += 1
+            return []
+        if message.source == message.target:
+            self.dropped["range: a node to itself"] += 1
+            return []
+        pair = (min(message.source, message.target), max(message.source, message.target))
+        if message.stamp <= self._newest_range.get(pair, -1):
+            self.dropped["range: stamp not after the pair's one before"] += 1
+            return []
+        if self._last is not None and message.stamp <= self._last - int(0.5e9):
+            self.dropped["range: arrived too late"] += 1
+            return []
+        if self._slot(message.source) is None or self._slot(message.target) is None:
+            self.dropped["range: more beacons than max_beacons"] += 1
+            return []
+        self._newest_range[pair] = message.stamp
+        self._ranges.append(message)
+        # where there is odometry it makes the frames; one that lags is waited for, or they would lack its increment
+        patience = _ODOMETRY_LAGS_S if self._odometry else 2 * self._wait_s
+        if message.stamp - (self._last or self._ranges[0].stamp) > patience * 1e9:
+            return self._without_scan(before=message.stamp)
+        return []
+
+    def _add_odometry(self, message: OdometryMessage) -> list[StampedFrame]:
+        if not self._settings.odom.use:
+            return []
+        if not np.isfinite([message.x, message.y, message.yaw]).all():
+            self.dropped["odometry: not finite"] += 1
+            return []
+        if self._odometry and message.stamp <= self._odometry[-1].stamp:
+            self.dropped["odometry: stamp not after the one before"] += 1
+            return []
+        self._odometry.append(message)
+        return self._by_odometry(message.stamp)  # the newest waits for the ranges of its own time
+
+    def _by_odometry(self, before: int) -> list[StampedFrame]:
+        """Frames at the odometry's own stamps while no scan comes: the turn between two is then measured, not assumed
+        to be even."""
+        if self._scan_at is None:
+            self._scan_at = self._odometry[0].stamp
+        frames = []
+        if self._odometry[-1].stamp - self._scan_at > _WITHOUT_SCAN_S * 1e9:
+            for stamp in [m.stamp for m in self._odometry if m.stamp < before]:
+                if self._last is None or stamp - self._last >= _ODOMETRY_EVERY_S * 1e9:
+                    ready = [m for m in self._ranges if m.stamp <= stamp]
+                    self._ranges = [m for m in self._ranges if m.stamp > stamp]
+                    frames.append(self._close(stamp, ready, None))
+        return frames
+
+    def _slot(self, node: int) -> int | None:
+        if node not in self.slots:
+            most = self._settings.uwb.max_beacons
+            if len(self.slots) > most:
+                if not self.warnings:
+                    self.warnings.append(f"node {node} is ignored: more than {most} beacons, see uwb.max_beacons")
+                return None
+            self.slots[node] = len(self.slots)
+        return self.slots[node]
+
+    def _without_scan(self, before: int | None) -> list[StampedFrame]:
+        """Frames for ranges that have waited: one whenever they span too long or fill a frame."""
+        self._ranges.sort(key=lambda m: m.stamp)
+        frames: list[StampedFrame] = []
+        while self._ranges:
+            first = self._last if self._last is not None else self._ranges[0].stamp
+            ready = [m for m in self._ranges if m.stamp - first <= self._wait_s * 1e9 or m is self._ranges[0]][
+                : self._max_ranges
+            ]
+            rest = self._ranges[len(ready) :]
+            overdue = before is None or (before - first > self._wait_s * 1.5e9) or len(self._ranges) > self._max_ranges
+            if not overdue or (before is not None and (ready[-1].stamp >= before or not rest)):
+                break
+            self._ranges = rest
+            self._wait_s = self._silent_wait()
+            frames.append(self._close(max(ready[-1].stamp, (self._last or 0) + 1), ready, None))
+        return frames
+
+    def _silent_wait(self) -> float:
+        """How long ranges wait while a LiDAR is silent [s]."""
+        if not self._intervals:
+            return _SCANLESS_S
+        return min(max(_BLIND_SCANS * float(np.median(self._intervals)) / 1e9, _BLIND_S), _SCANLESS_S)
+
+    def _close(self, stamp: int, ranges: list[RangeMessage], scan: ScanMessage | None) -> StampedFrame:
+        dt = 0.0 if self._last is None else (stamp - self._last) / 1e9
+        odometry = self._increment(stamp)
+        if len(ranges) > self._max_ranges:
+            self.dropped["range: more than one frame holds"] += len(ranges) - self._max_ranges
+            ranges = ranges[-self._max_ranges :]
+        frame = Frame(
+            dt=np.float32(dt),
+            has_scan=np.bool_(scan is not None),
+            scan=pad_scan(scan, self._settings),
+            ranges=pad_ranges(ranges, self.slots, stamp, self._max_ranges),
+            odometry=odometry,
+        )
+        self._last = stamp
+        return StampedFrame(stamp, frame, dict(self.slots))
+
+    def _increment(self, stamp: int) -> Odometry:
+        track, last = self._odometry, self._last
+        none = Odometry(np.zeros(3, np.float32), np.bool_(False))
+        if last is None or len(track) < 2 or track[0].stamp > last or stamp - track[-1].stamp > _ODOMETRY_HOLD_S * 1e9:
+            return none
+        a, b = _pose_at(track, last), _pose_at(track, stamp)
+        keep = max(0, bisect_right([m.stamp for m in track], stamp) - 2)
+        del track[:keep]
+        self.odometry_used = True
+        c, s = np.cos(a[2]), np.sin(a[2])
+        dx, dy = b[0] - a[0], b[1] - a[1]
+        turn = (b[2] - a[2] + np.pi) % (2 * np.pi) - np.pi
+        increment = np.array([c * dx + s * dy, -s * dx + c * dy, turn], np.float32)
+        return Odometry(increment, np.bool_(True))
+
+
+def _pose_at(track: list[OdometryMessage], stamp: int) -> tuple[float, float, float]:
+    """Odometry pose at a stamp, between two messages or held at the rate of the last two."""
+    at = min(max(bisect_right([m.stamp for m in track], stamp), 1), len(track) - 1)
+    a, b = track[at - 1], track[at]
+    f = min((stamp - a.stamp) / (b.stamp - a.stamp), 1.0 + _ODOMETRY_HOLD_S * 1e9 / (b.stamp - a.stamp))
+    turn = (b.yaw - a.yaw + np.pi) % (2 * np.pi) - np.pi
+    return a.x + f * (b.x - a.x), a.y + f * (b.y - a.y), a.yaw + f * turn
+
+
+def pad_scan(scan: ScanMessage | None, settings: Settings) -> Scan:
+    """A scan in the slots of a frame; more beams than slots are thinned evenly, no return is 0 and not valid."""
+    beams = settings.lidar.max_beams
+    ranges, valid = np.zeros(beams, np.float32), np.zeros(beams, bool)
+    if scan is None:
+        return Scan(ranges, valid, np.float32(0), np.float32(1e-3), np.float32(0))
+    stride = -(-scan.ranges.size // beams)
+    taken = np.asarray(scan.ranges[::stride], np.float32)
+    low, high = max(scan.range_min, settings.lidar.min_range), min(scan.range_max, settings.lidar.max_range)
+    with np.errstate(invalid="ignore"):
+        ok = np.isfinite(taken) & (taken >= low) & (taken <= high) & (taken > 0)
+    ranges[: taken.size], valid[: taken.size] = np.where(ok, taken, 0.0), ok
+    return Scan(
+        ranges,
+        valid,
+        np.float32(scan.angle_min),
+        np.float32(scan.angle_increment * stride),
+        np.float32(scan.time_increment * stride),
+    )
+
+
+def pad_ranges(messages: list[RangeMessage], slots: dict[int, int], stamp: int, size: int) -> Ranges:
+    """Ranges in the slots of a frame, with their age relative to its stamp."""
+    n = len(messages)
+    i, j = np.zeros(size, np.int32), np.zeros(size, np.int32)
+    j[:] = 1  # a pair of two nodes also where there is no range
+    distance, age = np.zeros(size, np.float32), np.zeros(size, np.float32)
+    gap, valid = np.full(size, np.nan, np.float32), np.zeros(size, bool)
+    for k, m in enumerate(messages):
+        i[k], j[k] = slots[m.source], slots[m.target]
+        distance[k], age[k] = m.range, (m.stamp - stamp) / 1e9
+        gap[k] = m.receive_power - m.first_path_power
+    valid[:n] = True
+    return Ranges(i, j, distance, age, gap, valid)

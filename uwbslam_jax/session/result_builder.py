@@ -1,0 +1,240 @@
+"""What a session reported as a Result: node ids for slots, one pose a frame, the summary. Writes no file."""
+
+from __future__ import annotations
+
+import dataclasses
+import resource
+from array import array
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from uwbslam_jax import __version__
+from uwbslam_jax.session.history import History
+from uwbslam_jax.startup.static_geometry import Relative
+from uwbslam_jax.result import BeaconEstimate, Result
+from uwbslam_jax.session.session import Session
+
+_NO_SCAN = "no scan: the track is that of odometry and ranges, the map is empty"
+_NO_TRACK = "no scan and no odometry: there is no track, the map is empty"
+_RELATIVE = "the robot has not moved: beacons are placed among themselves, rotation and reflection are arbitrary"
+
+
+@dataclass
+class Facts:
+    """What the Result tells besides what the session knows.
+
+    Attributes:
+      warnings: one line each.
+      dropped: measurements left out, by reason.
+      truncated: where the recording breaks, None where it does not.
+      odometry_used: whether any frame carried an increment.
+      wall_s, compile_s: time taken, and how much of it JAX compiled [s].
+      step_ms: one a frame [ms], without compilation.
+      relative: geometry of the nodes at rest while the robot has not moved, else None.
+    """
+
+    warnings: list[str] = field(default_factory=list)
+    dropped: Counter[str] = field(default_factory=Counter)
+    truncated: str | None = None
+    odometry_used: bool = False
+    wall_s: float = 0.0
+    compile_s: float = 0.0
+    step_ms: array[float] = field(default_factory=lambda: array("f"))
+    relative: Relative | None = None
+
+
+def to_result(session: Session, facts: Facts) -> Result:
+    """What a session reported, with node ids for slots. Poses of the frames that had a scan, of all frames where none
+    had and odometry made the track, of none where there was neither.
+
+    A run whose frame was never decided has its poses and map in the frame that the robot started in.
+    """
+    history = session.history
+    scans = bool(history.has_scan.values.any())
+    kept = history.has_scan.values if scans or not facts.odometry_used else np.ones(len(history.stamps), bool)
+    at = slice(None) if kept.all() else np.flatnonzero(kept)  # nothing is copied where it is all of them
+    told = [] if scans else [_NO_SCAN if facts.odometry_used else _NO_TRACK]
+    told += [] if facts.relative is None else [_RELATIVE]
+    told += _biases(session)
+    facts = dataclasses.replace(facts, warnings=[*facts.warnings, *told])
+    stamps = history.stamps.values[at]
+    start = int(stamps[0]) if len(stamps) else 0
+    ids = {slot: node for node, slot in session.slots.items()}
+    online = np.array(history.poses, float).reshape(-1, 3)
+    track = online if session.hindsight is None else session.hindsight.track
+    diagnostics = {name: values[at] for name, values in history.diagnostics.items()}
+    if len(facts.step_ms) == len(history.stamps):
+        diagnostics["step_ms"] = np.array(facts.step_ms, float)[at]
+    return Result(
+        stamps=stamps,
+        poses=track[at],
+        online=online[at],
+        online_covs=history.covs.values[at],
+        beacons=_beacons(session, ids) if facts.relative is None else _relative_beacons(session, facts.relative),
+        beacon_tracks=_tracks(history, ids, start),
+        map=session.tiles.image(session.state.grid),
+        range_residuals=_residuals(history, ids, start),
+        scan_points=_scan_points(session),
+        diagnostics=diagnostics,
+        events=list(history.events),
+        summary=_summary(session, facts),
+    )
+
+
+def _residuals(history: History, ids: dict[int, int], start: int) -> np.ndarray:
+    """(R, 4) t [s], nodes, residual [m]."""
+    rows = history.residuals.values
+    nodes = (np.array([ids[slot] for slot in rows[side].tolist()], float) for side in ("i", "j"))
+    return np.column_stack([(rows["stamp"] - start) / 1e9, *nodes, rows["residual"]])
+
+
+def _tracks(history: History, ids: dict[int, int], start: int) -> dict[int, np.ndarray]:
+    """Node -> (n, 4) t [s], x, y, sigma [m], the nodes in the order in which they were placed."""
+    rows = history.tracks.values
+    slots, first = np.unique(rows["slot"], return_index=True)
+    tracks = {}
+    for slot in slots[np.argsort(first)].tolist():
+        own = rows[rows["slot"] == slot]
+        tracks[ids[slot]] = np.column_stack([(own["stamp"] - start) / 1e9, own["x"], own["y"], own["s"]])
+    return tracks
+
+
+def _biases(session: Session) -> list[str]:
+    """A warning where notable biases were found that nobody configured."""
+    ids = {slot: node for node, slot in session.slots.items()}
+    found = {ids[slot]: bias for slot, bias in session.found_bias.items()}
+    told = ", ".join(f"node {node} {bias:+.2f} m" for node, bias in sorted(found.items()))
+    advice = "set uwb.bias if the radios are known"
+    return [f"ranges are biased: {told} were solved from the run; {advice}"] if session.biased else []
+
+
+def _beacons(session: Session, ids: dict[int, int]) -> list[BeaconEstimate]:
+    """Beacons as the whole run tells them where they rest, else as they are in the state, or were last reported."""
+    told = {}
+    if session.hindsight is not None:
+        solution = session.hindsight.solution
+        for b, node in enumerate(solution.nodes):
+            block = slice(3 + 2 * b, 5 + 2 * b)
+            told[node] = solution.beacons[b], solution.cov[block, block]
+    active = np.asarray(session.state.active)
+    mean, cov = np.asarray(session.state.belief.mean, float), np.asarray(session.state.belief.cov, float)
+    found = []
+    for slot in range(1, len(active)):
+        status = session.beacon_status(slot)
+        node = session.graph.ranges.node(slot)
+        if node in told and status != "moving":
+            position, block = told[node]
+            found.append(BeaconEstimate(ids[slot], position, block, status))
+        elif active[slot]:
+            two = slice(2 * slot, 2 * slot + 2)
+            found.append(BeaconEstimate(ids[slot], mean[two], cov[two, two], status))
+        elif slot in session.history.beacons:
+            left = status if status in ("moving", "silent") else "dropped"
+            # one that was dropped is remembered where it rested last
+            position, block = told.get((slot, node[1] - 1), session.history.beacons[slot])
+            found.append(BeaconEstimate(ids[slot], position.astype(float), block.astype(float), left))
+    return sorted(found, key=lambda beacon: beacon.id)
+
+
+def _relative_beacons(session: Session, relative: Relative) -> list[BeaconEstimate]:
+    """Beacons around a robot at rest, or among themselves where it is not heard; see relative.solve for the frame."""
+    robot = session.settings.robot
+    shift = np.array(robot.antenna[:2]) if robot.id in relative.nodes else np.zeros(2)
+    found = []
+    for k, node in enumerate(relative.nodes):
+        if node != robot.id:
+            two = slice(2 * k, 2 * k + 2)
+            found.append(BeaconEstimate(node, relative.positions[k] + shift, relative.cov[two, two], "relative"))
+    return found
+
+
+def _relative_summary(relative: Relative | None) -> dict[str, Any] | None:
+    """What is worth telling of a relative geometry."""
+    if relative is None:
+        return None
+    return {
+        "frame": "relative: rotation and reflection are arbitrary while nothing has moved",
+        "nodes": relative.nodes,
+        "links": relative.links,
+        "links_rejected": [list(pair) for pair in relative.rejected],
+        "ranges_rejected": relative.gross,
+        "residual_rms_m": relative.rms,
+        "offset_m": relative.offset,
+    }
+
+
+def _scan_points(session: Session) -> np.ndarray:
+    """(n, 2) the last scan in the published frame, each beam at its own time [m]."""
+    if session.history.last_scan is None:
+        return np.zeros((0, 2))
+    number, frame, estimate = session.history.last_scan
+    scan, lidar = frame.frame.scan, session.settings.robot.lidar
+    beam = np.flatnonzero(scan.valid)
+    bearing = float(scan.angle_min) + float(scan.angle_increment) * beam + lidar[2]
+    reach, age = np.asarray(scan.ranges, float)[beam], float(scan.time_increment) * beam
+    x, y = lidar[0] + reach * np.cos(bearing), lidar[1] + reach * np.sin(bearing)
+    # the estimate may be older than the published frame: its velocity counts relative to its own heading
+    track = session.history.poses if session.hindsight is None else session.hindsight.track
+    pose, velocity = track[number], np.asarray(estimate.velocity, float)
+    turned = pose[2] - float(estimate.pose[2])
+    c, s = np.cos(turned), np.sin(turned)
+    drift = np.array([c * velocity[0] - s * velocity[1], s * velocity[0] + c * velocity[1]])
+    heading = pose[2] + float(estimate.yaw_rate) * age
+    c, s = np.cos(heading), np.sin(heading)
+    return pose[:2] + np.stack([c * x - s * y, s * x + c * y], axis=-1) + age[:, None] * drift
+
+
+def _frame_beacons(session: Session) -> list[int]:
+    """Ids of the beacon at the published frame's origin and of the one on +x."""
+    ids = {slot: node for node, slot in session.slots.items()}
+    return [ids[slot] for slot in np.asarray(session.state.frame_slots).tolist()]
+
+
+def _summary(session: Session, facts: Facts) -> dict[str, Any]:
+    """The content of summary.json, see DESIGN; without evaluation figures.
+
+    The real-time factor is the recording's duration over the time taken, compilation left out.
+    """
+    history = session.history
+    ids = {slot: node for node, slot in session.slots.items()}
+    stamps, step_ms = history.stamps, facts.step_ms
+    duration = (stamps[-1] - stamps[0]) / 1e9 if stamps else 0.0
+    decided = None if session.decided_at is None else max(session.decided_at - stamps[0], 0) / 1e9
+    total = {name: int(np.sum(values)) for name, values in history.diagnostics.items()}
+    rejected = {"not in line of sight": total.get("ranges_nlos", 0), "doubted": total.get("ranges_doubted", 0)}
+    used = total.get("ranges_used", 0)
+    rejected["node not placed"] = total.get("ranges", 0) - used - sum(rejected.values())
+    return {
+        "steps": len(stamps),
+        "duration_s": duration,
+        "wall_s": facts.wall_s,
+        "compile_s": facts.compile_s,
+        "step_ms_median": float(np.median(step_ms)) if step_ms else None,
+        "step_ms_p95": float(np.percentile(step_ms, 95)) if step_ms else None,
+        "real_time_factor": duration / max(facts.wall_s - facts.compile_s, 1e-9),
+        "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,  # kB on Linux
+        "decided_at": decided,
+        "frame_beacons": None if decided is None else _frame_beacons(session),
+        "relative": _relative_summary(facts.relative),
+        "hypotheses": session.hypotheses,
+        "status": session.status,
+        "ids": sorted(node for node, slot in session.slots.items() if slot > 0),
+        "odometry_used": facts.odometry_used,
+        "poor_matches": total.get("poor_match", 0),
+        "searches": total.get("searched", 0),
+        "keyframes": len(session.graph.keyframes),
+        "scans_laid_over_others": len(session.graph.edges),
+        "revisions": {"solved": session.revisions, "taken_over": session.taken_over},
+        "events": [[round((stamp - int(stamps[0])) / 1e9, 3), text] for stamp, text in history.events],
+        "ranges_used": used,
+        "ranges_rejected": rejected,
+        "found_bias": {str(ids[slot]): bias for slot, bias in sorted(session.found_bias.items())},
+        "dropped": dict(sorted(facts.dropped.items())),
+        "truncated": facts.truncated,
+        "warnings": facts.warnings,
+        "version": __version__,
+        "config": dataclasses.asdict(session.settings),
+    }

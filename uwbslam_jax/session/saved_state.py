@@ -1,0 +1,177 @@
+"""What a run has found, saved to go on from: filter, map and beacons as one file, state.npz. And going on from it.
+
+A run that goes on knows neither where the robot is now nor how it is turned: its ranges to the saved beacons tell the
+place, and the search of the first match the heading.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from uwbslam_jax.beacons import state_edits
+from uwbslam_jax.estimator import step
+from uwbslam_jax.settings import Settings, make_config, make_params
+from uwbslam_jax.numerics.gaussian import Gaussian
+from uwbslam_jax.measurements import RangeMessage
+from uwbslam_jax.numerics.multilateration import locate
+from uwbslam_jax.files.run_folder import RunError
+from uwbslam_jax.session.session import Session
+from uwbslam_jax.estimator.step import State
+from uwbslam_jax.mapping.tiled_map import Tiles
+
+FILE = "state.npz"
+_VERSION = 1
+_WINDOW_S = 0.5
+"""The robot is placed by the ranges of so long a time; it may drive meanwhile."""
+_FEWEST = 3
+"""Beacons that place the robot."""
+_PATIENCE_S = 5.0
+"""Where the ranges do not tell for so long, the robot is taken to be where it was."""
+_PINNED_M = 1e-3
+"""Standard deviation of a beacon that is taken as it is [m]."""
+
+
+@dataclass(frozen=True)
+class Saved:
+    """What a run has found, on the host.
+
+    Attributes:
+      state: of the estimator, numpy; tiles: of its map.
+      slots: node id -> slot; found_bias: slot -> [m].
+    """
+
+    state: State
+    tiles: Tiles
+    slots: dict[int, int]
+    found_bias: dict[int, float]
+
+
+def snapshot(session: Session) -> Saved:
+    """What a session has found so far; a copy, as a step takes its state's memory over."""
+    state = jax.tree.map(lambda leaf: np.array(leaf, copy=True), session.state)
+    return Saved(state, session.tiles.copy(), dict(session.slots), dict(session.found_bias))
+
+
+def save(saved: Saved, directory: Path) -> None:
+    """Writes state.npz; one that is there is replaced as a whole or not at all. Raises OSError."""
+    places, layers = saved.tiles.dump()
+    arrays = {f"state{name}": leaf for name, leaf in _leaves(saved.state)}
+    arrays |= {"tiles": places} | {f"layer{k}": layer for k, layer in enumerate(layers)}
+    about = {"version": _VERSION, "resolution": saved.tiles.resolution}
+    about |= {"slots": list(saved.slots.items()), "found_bias": list(saved.found_bias.items())}
+    part = directory / f"{FILE}.part"
+    with part.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, about=np.array(json.dumps(about)), **arrays)
+    os.replace(part, directory / FILE)
+
+
+def load(directory: Path, settings: Settings) -> Saved:
+    """Reads state.npz for a run with these settings.
+
+    Raises:
+      RunError: there is none, it is damaged, or its map or slots have another size than these settings ask for.
+    """
+    path = directory / FILE
+    try:
+        with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:  # of a damaged one it keeps a path open
+            arrays: dict[str, Any] = {name: file[name] for name in file.files}
+        about = json.loads(str(arrays["about"]))
+        if about["version"] != _VERSION:
+            raise RunError(f"{path}: version {about['version']}, this program reads {_VERSION}")
+        if about["resolution"] != settings.map.resolution:
+            raise RunError(f"{path}: saved with map.resolution {about['resolution']:g}")
+        tiles = Tiles(settings.map.resolution)
+        tiles.load(arrays["tiles"], [arrays[f"layer{k}"] for k in range(sum(n.startswith("layer") for n in arrays))])
+        like = jax.eval_shape(lambda: step.init(make_config(settings)))
+        for name, leaf in _leaves(like):
+            if arrays[f"state{name}"].shape != leaf.shape:
+                raise RunError(f"{path}: saved with other map.size_m, map.levels or uwb.max_beacons")
+        leaves = [arrays[f"state{name}"] for name, _ in _leaves(like)]
+        state = jax.tree.unflatten(jax.tree.structure(like), leaves)
+        slots = {int(node): int(slot) for node, slot in about["slots"]}
+        found_bias = {int(slot): float(bias) for slot, bias in about["found_bias"]}
+        return Saved(state, tiles, slots, found_bias)
+    except OSError as error:
+        raise RunError(f"{path}: {error.strerror or error}") from None
+    except (KeyError, ValueError, zipfile.BadZipFile, EOFError) as error:
+        raise error if isinstance(error, RunError) else RunError(f"{path}: not a saved state: {error}") from None
+
+
+def _leaves(tree: Any) -> list[tuple[str, Any]]:
+    return [(jax.tree_util.keystr(path), leaf) for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]]
+
+
+class Locator:
+    """Where a robot is among saved beacons, by its first ranges."""
+
+    def __init__(self, saved: Saved, settings: Settings):
+        params = make_params(settings, saved.slots)
+        self._robot, self._sigma = settings.robot.id, settings.uwb.sigma_n
+        self._slots, self._bias = saved.slots, np.array(params.bias, float)
+        for slot, bias in saved.found_bias.items():
+            self._bias[slot] += bias
+        self._height, self._scale = np.asarray(params.height, float), float(params.bias_scale)
+        self._places = np.asarray(saved.state.belief.mean, float)[: 2 * len(self._bias)].reshape(-1, 2)
+        self._known = np.asarray(saved.state.active) & ~np.asarray(saved.state.moving)
+        self._heard: list[tuple[int, int, float]] = []
+        self._since: int | None = None
+
+    def hear(self, stamp: int, message: object) -> np.ndarray | None:
+        """Position (2,) [m] once the messages up to a stamp [ns] tell it, or have not told it for long."""
+        self._since = stamp if self._since is None else self._since
+        if isinstance(message, RangeMessage) and np.isfinite(message.range):
+            ends = [self._slots.get(message.source, -1), self._slots.get(message.target, -1)]
+            if 0 in ends and max(ends) > 0 and self._known[max(ends)]:
+                self._heard.append((stamp, max(ends), message.range))
+        self._heard = [entry for entry in self._heard if stamp - entry[0] < _WINDOW_S * 1e9]
+        if len({slot for _, slot, _ in self._heard}) >= _FEWEST and stamp - self._heard[0][0] > 0.6 * _WINDOW_S * 1e9:
+            slot = np.array([entry[1] for entry in self._heard])
+            slant = (np.array([entry[2] for entry in self._heard]) - self._bias[slot] - self._bias[0]) / (
+                1 + self._scale
+            )
+            flat = np.sqrt(np.maximum(slant**2 - (self._height[slot] - self._height[0]) ** 2, 0.01))
+            found = locate(self._places[slot], flat, np.full(len(flat), 2 * self._sigma))
+            if found is not None:
+                return found[0]
+        return self._places[0].copy() if stamp - self._since > _PATIENCE_S * 1e9 else None
+
+
+def go_on(session: Session, saved: Saved, place: np.ndarray, stamp: int, *, fixed: bool) -> None:
+    """Lets a new session start from a saved run.
+
+    Args:
+      place: (2,) where the robot is now [m].
+      stamp: of the moment [ns].
+      fixed: map and beacons stay as they are.
+    """
+    state = jax.tree.map(jnp.asarray, saved.state)
+    for slot in np.flatnonzero(np.asarray(state.moving)):
+        state = state_edits.remove(state, int(slot))  # where it has been carried since, nobody knows
+    state = state_edits.put_robot(state, place)
+    if fixed:
+        state = _pinned(state)
+    session.fixed = fixed
+    session.go_on(state, saved.tiles.copy(), saved.slots, saved.found_bias, stamp)
+    session.history.event(stamp, "localising in a saved map" if fixed else "going on from a saved run")
+
+
+def _pinned(state: State) -> State:
+    """The state with beacons that ranges do not move, and a map that is not drawn on: no pose is far from NaN."""
+    slots = np.flatnonzero(np.asarray(state.active))[1:]
+    own = np.concatenate([[2 * slot, 2 * slot + 1] for slot in slots]).astype(int) if len(slots) else np.zeros(0, int)
+    P = np.array(state.belief.cov)
+    P[own, :] = P[:, own] = 0.0
+    P[own, own] = _PINNED_M**2
+    nowhere = jnp.full(3, jnp.nan, jnp.float32)
+    enough = jnp.maximum(state.scans_drawn, 1000)
+    belief = Gaussian(state.belief.mean, jnp.asarray(P, jnp.float32))
+    return state._replace(belief=belief, drawn_pose=nowhere, scans_drawn=enough)

@@ -1,0 +1,270 @@
+"""What start-up remembers: keyframes of the LiDAR's (or the odometry's) track, and the ranges taken along it.
+
+Bounded in size; the ranges are kept raw, each with its own time, because where LiDAR sees nothing along a corridor the
+track between two keyframes is not to be trusted and a range belongs to a place between the two.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from uwbslam_jax.measurements import Ranges, Snapshot, StampedFrame
+from uwbslam_jax.numerics.multilateration import RANGE_FLOOR_M
+
+_MOVED = (0.25, 0.2)
+"""A keyframe every so much of path or turn [m, rad]."""
+_BLIND_S = 0.5
+_BLIND_M = 0.3
+"""A keyframe also after this time where the scan cannot tell the position to this standard deviation: the track then
+says little about how far the robot has moved."""
+_MOST_KEYFRAMES = 64
+"""A longer start is thinned: every other keyframe goes."""
+_MOST_SIGHTINGS = 3000
+_MOST_OF_PAIR = 400
+_WINDOW = 21
+"""So many ranges of a pair around one tell how much they scatter there."""
+_WILD_M = 0.5
+"""A range this far from the median of its interval takes no part in the mean."""
+_QUIET = 1.6
+"""Scatter beyond this multiple of sigma_n is no chance but a range through walls or a radio that locks early."""
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """One pose of the start-up track.
+
+    Attributes:
+      frame: its measurements; the scan is drawn again when the frame is decided.
+      pose: (3,) in the start frame [m, m, rad].
+      information: (3, 3) of its match, in the start frame; 0 where LiDAR said nothing.
+      velocity, yaw_rate: of the robot then, to undo the sweep [m/s, rad/s].
+      odometry: whether wheels measured the whole way from the keyframe before.
+    """
+
+    frame: StampedFrame
+    pose: np.ndarray
+    information: np.ndarray
+    velocity: np.ndarray
+    yaw_rate: float
+    odometry: bool = False
+
+    def snapshot(self) -> Snapshot:
+        """Its scan and how the robot moved."""
+        drift = turned(-self.pose[2], self.velocity).astype(np.float32)
+        return Snapshot(self.frame.frame.scan, drift, np.float32(self.yaw_rate))
+
+    @property
+    def blind(self) -> bool:
+        """Whether nothing told how far the robot moved in some direction."""
+        return not self.odometry and bool(np.linalg.eigvalsh(self.information[:2, :2])[0] < _BLIND_M**-2)
+
+
+class Sighting(NamedTuple):
+    """One range between the robot and a beacon: time [ns], pose of the track then (3,), distance in the plane [m]."""
+
+    stamp: int
+    pose: np.ndarray
+    distance: float
+
+
+class Averages(NamedTuple):
+    """Ranges of the robot to the beacons, averaged over halves of the intervals between keyframes.
+
+    Attributes:
+      at: (R,) keyframe before; to: (R,) slot.
+      share: (R,) how far on the way to the next keyframe, 0 to 1.
+      before, after: (R, 2) where the antenna was, in the frame of the keyframe before and of the one after [m].
+      distance, sigma: (R,) [m].
+    """
+
+    at: np.ndarray
+    to: np.ndarray
+    share: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+    distance: np.ndarray
+    sigma: np.ndarray
+
+
+class Buffer:
+    """Keyframes and ranges of the start.
+
+    Attributes:
+      keyframes: kept so far. sightings: slot -> ranges of the robot to it; pairs: (i, j) -> ranges between beacons.
+      antenna: (2,) on the robot [m]; height, bias: (K,) [m]; sigma_n [m]; bias_scale [m/m].
+    """
+
+    def __init__(
+        self, antenna: np.ndarray, height: np.ndarray, bias: np.ndarray, sigma_n: float, bias_scale: float = 0.0
+    ):
+        self.keyframes: list[Keyframe] = []
+        self.sightings: dict[int, deque[Sighting]] = {}
+        self.pairs: dict[tuple[int, int], deque[float]] = {}
+        self.antenna, self.height, self.bias, self.sigma_n = antenna, height, bias, sigma_n
+        self.bias_scale = bias_scale
+        self._latest: Keyframe | None = None
+        self._odometry = True
+
+    @property
+    def extent(self) -> float:
+        """Largest distance from the first keyframe [m]."""
+        if not self.keyframes:
+            return 0.0
+        return max(float(np.linalg.norm(k.pose[:2] - self.keyframes[0].pose[:2])) for k in self.keyframes)
+
+    @property
+    def newest(self) -> int:
+        """Stamp of the newest keyframe [ns], 0 without any."""
+        return self.keyframes[-1].frame.stamp if self.keyframes else 0
+
+    def track(self) -> list[Keyframe]:
+        """The keyframes and, after them, where the robot is now."""
+        if self._latest is None or self._latest.frame.stamp <= self.newest:
+            return list(self.keyframes)
+        return [*self.keyframes, self._latest]
+
+    def add(self, frame: StampedFrame, estimate, usable: np.ndarray) -> None:
+        """Take in one frame with the pose that LiDAR (and odometry) gave it.
+
+        Args:
+          estimate: slam.Estimate of the frame.
+          usable: (M,) which of its ranges may be used.
+        """
+        pose = np.asarray(estimate.pose, float)
+        measured = bool(frame.frame.odometry.valid)
+        self._odometry = self._odometry and measured
+        if (bool(frame.frame.has_scan) and not estimate.poor) or measured or not self.keyframes:
+            self._latest = Keyframe(
+                frame,
+                pose,
+                np.asarray(estimate.information, float),
+                np.asarray(estimate.velocity, float),
+                float(estimate.yaw_rate),
+                self._odometry,
+            )
+            if not self.keyframes or self._far_from_last(self._latest):
+                self.keyframes.append(self._latest)
+                self._odometry = True
+                if len(self.keyframes) > _MOST_KEYFRAMES:
+                    self._thin()
+        for k in np.flatnonzero(usable):
+            self._add_range(frame, int(k), pose, np.asarray(estimate.velocity, float), float(estimate.yaw_rate))
+
+    def _far_from_last(self, key: Keyframe) -> bool:
+        last = self.keyframes[-1]
+        moved = key.pose - last.pose
+        blind = key.blind and key.frame.stamp - last.frame.stamp > _BLIND_S * 1e9
+        return bool(np.hypot(*moved[:2]) > _MOVED[0] or abs(moved[2]) > _MOVED[1] or blind)
+
+    def _add_range(self, frame: StampedFrame, k: int, pose: np.ndarray, velocity: np.ndarray, yaw_rate: float) -> None:
+        r: Ranges = frame.frame.ranges
+        i, j = sorted((int(r.i[k]), int(r.j[k])))
+        rise = self.height[i] - self.height[j]
+        slant = (float(r.range[k]) - self.bias[i] - self.bias[j]) / (1.0 + self.bias_scale)
+        flat = float(np.sqrt(max(slant**2 - rise**2, 0.01)))
+        if i > 0:
+            self.pairs.setdefault((i, j), deque(maxlen=_MOST_OF_PAIR)).append(flat)
+            return
+        age = float(r.age[k])
+        then = pose + age * np.append(velocity, yaw_rate)
+        kept = self.sightings.setdefault(j, deque())
+        kept.append(Sighting(frame.stamp + round(age * 1e9), then, flat))
+        if len(kept) > _MOST_SIGHTINGS:
+            self.sightings[j] = deque(list(kept)[::2])
+
+    def _thin(self) -> None:
+        # a step is long enough to be measured by wheels only if both of its halves were
+        kept = [self.keyframes[0]]
+        for first, second in zip(self.keyframes[1::2], self.keyframes[2::2], strict=False):
+            kept.append(replace(second, odometry=first.odometry and second.odometry))
+        if kept[-1].frame.stamp < self.newest:
+            kept.append(self.keyframes[-1])
+        self.keyframes = kept
+
+    def averages(self, keys: list[Keyframe]) -> Averages:
+        """The robot's ranges averaged over the intervals between keyframes."""
+        stamps = np.array([key.frame.stamp for key in keys], float)
+        poses = np.array([key.pose for key in keys])
+        parts = [self._average_slot(slot, stamps, poses) for slot in sorted(self.sightings)]
+        if not parts:
+            none, number = np.zeros(0), np.zeros(0, int)
+            return Averages(number, number, none, np.zeros((0, 2)), np.zeros((0, 2)), none, none)
+        return Averages(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+    def _average_slot(self, slot: int, stamps: np.ndarray, poses: np.ndarray) -> Averages:
+        kept = self.sightings[slot]
+        stamp = np.array([s.stamp for s in kept], float)
+        pose, distance = np.array([s.pose for s in kept]), np.array([s.distance for s in kept])
+        at = np.clip(np.searchsorted(stamps, stamp, side="right") - 1, 0, len(stamps) - 1)
+        after = np.minimum(at + 1, len(stamps) - 1)
+        share = np.where(after > at, (stamp - stamps[at]) / np.maximum(stamps[after] - stamps[at], 1.0), 0.0)
+        share = np.clip(share, 0.0, 1.0)
+        antenna = pose[:, :2] + turned(pose[:, 2], self.antenna)
+        local = [turned(-poses[k, 2], antenna - poses[k, :2]) for k in (at, after)]
+        scatter = self._scatter(distance)
+        # two means in each interval: one would leave the keyframes free to move to and fro between their middles
+        halves = 2 * at + (share >= 0.5)
+        groups = np.unique(halves)
+        rows = []
+        for k in groups:
+            mine = np.flatnonzero(halves == k)
+            middle = np.sort(distance[mine])[len(mine) // 2]  # one of them, so that at least one is near it
+            ok = mine[np.abs(distance[mine] - middle) < _WILD_M]
+            sigma = mean_sigma(len(ok), float(np.median(scatter[mine])), self.sigma_n)
+            rows.append((share[ok].mean(), local[0][ok].mean(0), local[1][ok].mean(0), distance[ok].mean(), sigma))
+        share, before, after, distance, sigma = (np.array(column) for column in zip(*rows, strict=True))
+        # a wall makes all of its ranges too long: many of them tell no more than one
+        walled = sigma > mean_sigma(1, self.sigma_n, self.sigma_n)
+        sigma = np.where(walled, sigma * np.sqrt(max(np.sum(walled), 1)), sigma)
+        return Averages(groups // 2, np.full(len(groups), slot), share, before, after, distance, sigma)
+
+    def _scatter(self, distance: np.ndarray) -> np.ndarray:
+        """(R,) standard deviation of a pair's ranges around each of them, from second differences: a model-free one,
+        so that it can tell a range through walls from a place that is not yet right."""
+        if len(distance) < _WINDOW:
+            return np.full(len(distance), self.sigma_n)
+        second = np.abs(distance[2:] - 2 * distance[1:-1] + distance[:-2])
+        window = np.lib.stride_tricks.sliding_window_view(second, min(_WINDOW, len(second)))
+        # the median of |x| of a normal x is 0.674 sigma, and a second difference has 6 sigma^2
+        sigma = np.median(window, axis=1) / (0.674 * np.sqrt(6.0))
+        at = np.clip(np.arange(len(distance)) - 1 - window.shape[1] // 2, 0, len(sigma) - 1)
+        return sigma[at]
+
+    def scatter(self, nodes: int) -> np.ndarray:
+        """(K, K) log of how many times sigma_n each pair's latest ranges scatter, at least 0, see ranging."""
+        found = np.zeros((nodes, nodes))
+        for slot, kept in self.sightings.items():
+            latest = np.array([s.distance for s in kept])[-2 * _WINDOW :]
+            found[0, slot] = found[slot, 0] = self._scatter(latest)[-1]
+        for (i, j), kept in self.pairs.items():
+            latest = np.array(kept)[-2 * _WINDOW :]
+            found[i, j] = found[j, i] = np.median(np.abs(latest - np.median(latest))) / 0.674
+        return np.log(np.maximum(found / self.sigma_n, 1.0))
+
+    def pair_medians(self) -> dict[tuple[int, int], tuple[float, float]]:
+        """(i, j) -> median range between two beacons and its standard deviation [m]."""
+        found = {}
+        for pair, kept in self.pairs.items():
+            values = np.array(kept)
+            middle = float(np.median(values))
+            scatter = float(np.median(np.abs(values - middle))) / 0.674 if len(values) >= 5 else self.sigma_n
+            # a median of n is as good as a mean of 0.64 n
+            found[pair] = middle, mean_sigma(0.64 * len(values), scatter, self.sigma_n)
+        return found
+
+
+def mean_sigma(count: float, scatter: float, sigma_n: float) -> float:
+    """Standard deviation of a mean of `count` ranges; where they scatter more than the radio does, what makes them
+    scatter does not average out."""
+    excess = max(scatter**2 - (_QUIET * sigma_n) ** 2, 0.0)
+    return float(np.sqrt(sigma_n**2 / max(count, 1.0) + RANGE_FLOOR_M**2 + excess))
+
+
+def turned(theta: np.ndarray | float, xy: np.ndarray) -> np.ndarray:
+    """Vectors (..., 2) turned by angles (...) [rad]."""
+    c, s = np.cos(theta), np.sin(theta)
+    return np.stack([c * xy[..., 0] - s * xy[..., 1], s * xy[..., 0] + c * xy[..., 1]], axis=-1)

@@ -1,0 +1,304 @@
+"""What the live view shows: a run in progress as the events that let its page grow. No socket here.
+
+The loop calls `step` with each estimate, which only keeps references; `events`, in another thread, makes text of them.
+"""
+
+from __future__ import annotations
+
+import html
+import json
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import numpy as np
+
+from uwbslam_jax.web import page
+from uwbslam_jax.mapping.grid import Grid
+from uwbslam_jax.measurements import StampedFrame
+from uwbslam_jax.web.page_data import extent, numbers, picture
+from uwbslam_jax.result import BeaconEstimate
+from uwbslam_jax.session.session import Session
+from uwbslam_jax.estimator.step import Estimate
+from uwbslam_jax.mapping.tiled_map import Tiles
+
+STEP_S = 0.1
+"""Time between two steps that are shown."""
+WORDS_S = 0.5
+MAP_S = 1.0
+_TRACK = 4000
+"""Poses of the track that are kept; then every other one is left out."""
+_LINK_S = 1.0
+"""A link is shown for so long after its last range."""
+_EVENTS = 12
+_HINTS = {
+    "waiting for motion": "Waiting for motion: beacons and frame are found once the robot drives.",
+    "placing beacons": "Placing beacons: not enough is known of them yet. Drive on, and turn.",
+    "reflection undecided": "Reflection undecided: the ranges fit a mirrored place as well until the robot turns.",
+}
+_COLUMNS = ("t", "x", "y", "yaw", "xx", "xy", "yy")
+
+Event = tuple[str, str]
+"""Name and JSON of an event."""
+
+
+@dataclass
+class Status:
+    """Figures of a live run that no estimate tells.
+
+    Attributes:
+      rates: of each device by name [1/s]; dropped: by reason.
+      latency_ms: scan arrival to published pose, median and 99 % of the last while; None before the first.
+      troubles: what a user should mend, one line each.
+    """
+
+    rates: dict[str, float] = field(default_factory=dict)
+    dropped: dict[str, int] = field(default_factory=dict)
+    latency_ms: tuple[float, float] | None = None
+    troubles: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class _Now:
+    """One step, as the loop left it."""
+
+    t: float
+    frame: StampedFrame
+    estimate: Estimate
+    slots: dict[int, int]
+    states: dict[int, str]
+    status: str
+    decided: bool
+    events: list[tuple[int, str]]
+    links: dict[tuple[int, int], tuple[float, float | None]]
+
+
+class LivePage:
+    """The page of a live run.
+
+    Attributes:
+      title: heading, plain text.
+      watched: whether anybody looks; without, nothing is copied.
+    """
+
+    def __init__(self, title: str):
+        self.title = title
+        self.watched = False
+        self._now: _Now | None = None
+        self._told: _Now | None = None
+        self._status = Status()
+        self._map: tuple[Grid, Tiles] | None = None
+        self._map_at = 0.0
+        self._picture: dict[str, Any] = {"map": None, "extent": [-5.0, -5.0, 5.0, 5.0]}
+        self._track: list[tuple[float | None, ...]] = []
+        self._every, self._skipped = 1, 0
+        self._start: int | None = None
+        self._events = 0
+        self._lidar = (0.0, 0.0, 0.0)
+        self._links: dict[tuple[int, int], tuple[float, float | None]] = {}
+        self._lock = threading.Lock()
+        self._fresh = False
+
+    def step(self, session: Session, frame: StampedFrame, estimate: Estimate, status: Status) -> None:
+        """Takes in one step; called by the loop."""
+        if self._start is None:
+            if not frame.frame.has_scan:
+                return  # time counts from the first scan, as in the report
+            self._start = frame.stamp
+        t = (frame.stamp - self._start) / 1e9
+        before = self._now
+        self._links |= _links(t, frame, estimate, session.slots)
+        if len(session.history.events) != self._events:
+            self._events = len(session.history.events)
+            self._take_track(session)
+        elif before is not None and t - before.t < STEP_S:
+            return
+        self._lidar = session.settings.robot.lidar
+        states = {slot: session.beacon_status(slot) for slot in session.slots.values() if slot}
+        events = session.history.events[-_EVENTS:]
+        decided = session.decided_at is not None
+        links = {pair: told for pair, told in self._links.items() if told[0] > t - _LINK_S}
+        now = _Now(t, frame, estimate, session.slots, states, session.status, decided, events, links)
+        with self._lock:
+            self._now, self._status = now, status
+            self._track.append(_row(t, np.asarray(estimate.pose, float), np.asarray(estimate.pose_cov, float)))
+            if len(self._track) > _TRACK:
+                del self._track[1:-1:2]
+        if self.watched and time.monotonic() - self._map_at > MAP_S:
+            self._map_at = time.monotonic()
+            self._map = jax.tree.map(lambda leaf: np.array(leaf, copy=True), session.state.grid), session.tiles.copy()
+
+    def _take_track(self, session: Session) -> None:
+        """What happened may have changed the track so far: the frame was decided, or a longer run tells it better."""
+        history = session.history
+        pick = np.unique(np.linspace(0, max(len(history.stamps) - 1, 0), _TRACK // 2).astype(int))
+        with self._lock:
+            self._track = [
+                _row(float(history.stamps[k] - (self._start or 0)) / 1e9, history.poses[k], history.covs[k])
+                for k in pick[: len(history.stamps)]
+            ]
+            self._fresh = True
+
+    def whole(self) -> str:
+        """The page as it is now, for a new viewer."""
+        notice = page.notices([("info", "Waiting for the first scan.")])
+        sections = "".join(
+            page.section(title, f'<div id="{name}"></div>')
+            for name, title in (("beacon-words", "Beacons"), ("event-words", "Events"))
+        )
+        data = {**self.begin(), "live": True, "diagnostics": []}
+        data["residuals"] = {"t": [], "v": [], "pair": [], "pairs": [], "kind": [], "bound": 1.0}
+        return page.render(page.Parts(self.title, "", notice, "", f'<div class="two">{sections}</div>', data))
+
+    def begin(self) -> dict[str, Any]:
+        """What a new viewer has to know: the event `begin`."""
+        with self._lock:
+            rows = list(self._track)
+            now = self._now
+        track = {name: [row[k] for row in rows] for k, name in enumerate(_COLUMNS)}
+        beacons = [] if now is None else _beacons(now)
+        scan, links = ([], []) if now is None else (_scan(now, self._lidar), _shown_links(now))
+        last = rows[-1][0] if rows else None
+        return {
+            **self._picture,
+            "duration": last or 1e-3,
+            "track": track,
+            "beacons": beacons,
+            "scan": scan,
+            "links": links,
+        }
+
+    def events(self) -> Iterator[Event]:
+        """What has changed since the last call, one event after the other."""
+        with self._lock:
+            now, fresh, self._fresh = self._now, self._fresh, False
+        if now is None:
+            return
+        if fresh:
+            yield "begin", _json(self.begin())
+        seen, self._map = self._map, None
+        if seen is not None:
+            image = seen[1].image(seen[0])
+            drawn = picture(image)
+            spots = [np.asarray(now.estimate.pose[:2], float)[None], *(b.position[None] for b in _estimates(now))]
+            self._picture = {"map": drawn, "extent": extent(spots, drawn)}
+            yield "map", _json(self._picture)
+        if now is self._told:
+            return
+        self._told = now
+        pose = dict(
+            zip(_COLUMNS, _row(now.t, np.asarray(now.estimate.pose), np.asarray(now.estimate.pose_cov)), strict=True)
+        )
+        shown = {"pose": pose, "scan": _scan(now, self._lidar), "links": _shown_links(now), "beacons": _beacons(now)}
+        yield "step", _json(shown)
+
+    def words(self) -> Event:
+        """Figures, warnings and tables: the event `words`, HTML by the id of the element that holds it."""
+        with self._lock:
+            now, status = self._now, self._status
+        notices = [("warn", text) for text in status.troubles]
+        if now is None:
+            return "words", _json({"notices": page.notices([*notices, ("info", "Waiting for the first scan.")])})
+        if not now.decided and now.status in _HINTS:
+            notices.append(("warn", _HINTS[now.status]))
+        e = now.estimate
+        if bool(e.poor) and now.frame.frame.has_scan:
+            notices.append(("info", "The scan does not fit the map: it is not drawn."))
+        begin = self._start or 0
+        rows = [(f"{(stamp - begin) / 1e9:.1f}", text) for stamp, text in reversed(now.events)]
+        return "words", _json(
+            {
+                "notices": page.notices(notices),
+                "tiles": page.tiles(_figures(now, status)),
+                "beacon-words": page.beacon_table(_estimates(now)),
+                "event-words": page.table(("Time [s]", "What happened"), rows, [0]),
+            }
+        )
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, separators=(",", ":"), allow_nan=False)
+
+
+def _row(t: float, pose: np.ndarray, cov: np.ndarray) -> tuple[float | None, ...]:
+    """Time, pose and covariance of the place as the page has them."""
+    return (*numbers(np.array([t, *pose]), 3), *numbers(np.array([cov[0, 0], cov[0, 1], cov[1, 1]]), 6))
+
+
+def _scan(now: _Now, lidar: tuple[float, float, float]) -> list[list[float | None]]:
+    """The scan in the frame of the map; at this size motion during the scan does not show."""
+    scan = now.frame.frame.scan
+    beam = np.flatnonzero(scan.valid)[::2]
+    bearing = float(scan.angle_min) + float(scan.angle_increment) * beam + lidar[2]
+    reach, pose = np.asarray(scan.ranges, float)[beam], np.asarray(now.estimate.pose, float)
+    x, y = lidar[0] + reach * np.cos(bearing), lidar[1] + reach * np.sin(bearing)
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    points = np.stack([pose[0] + c * x - s * y, pose[1] + s * x + c * y], axis=-1)
+    flat = numbers(points, 2)
+    return [flat[k : k + 2] for k in range(0, len(flat), 2)]
+
+
+def _links(
+    t: float, frame: StampedFrame, estimate: Estimate, slots: dict[int, int]
+) -> dict[tuple[int, int], tuple[float, float | None]]:
+    """Time and measured less predicted range [m] of each pair of ids that ranged; None where the range was left out."""
+    r, ids = frame.frame.ranges, {slot: node for node, slot in slots.items()}
+    valid = np.flatnonzero(np.asarray(r.valid) & np.asarray(estimate.active)[r.i] & np.asarray(estimate.active)[r.j])
+    found = {}
+    for k in valid.tolist():
+        a, b = sorted((ids[int(r.i[k])], ids[int(r.j[k])]))
+        found[a, b] = (t, float(estimate.innovation[k]) if estimate.weight[k] > 0 else None)
+    return found
+
+
+def _shown_links(now: _Now) -> list[list[float | None]]:
+    return [[*pair, None if r is None else numbers(np.array(r), 3)[0]] for pair, (_, r) in sorted(now.links.items())]
+
+
+def _estimates(now: _Now) -> list[BeaconEstimate]:
+    """Every beacon heard; one that is not in the state has no place."""
+    e, nowhere = now.estimate, (np.full(2, np.nan), np.full((2, 2), np.nan))
+    found = []
+    for node, slot in sorted(now.slots.items()):
+        if slot:
+            known = bool(e.active[slot])
+            place = (np.asarray(e.beacons[slot], float), np.asarray(e.beacon_covs[slot], float)) if known else nowhere
+            found.append(BeaconEstimate(node, *place, now.states.get(slot, "waiting")))
+    return found
+
+
+def _beacons(now: _Now) -> list[dict[str, Any]]:
+    placed = [b for b in _estimates(now) if np.isfinite(b.position).all()]
+    return [
+        {
+            "id": b.id,
+            "status": b.status,
+            **dict(zip("xy", numbers(b.position, 3), strict=True)),
+            "cov": numbers(np.array([b.cov[0, 0], b.cov[0, 1], b.cov[1, 1]]), 6),
+            "track": None,
+        }
+        for b in placed
+    ]
+
+
+def _figures(now: _Now, status: Status) -> list[tuple[str, str, str]]:
+    """Headline figures."""
+    median, worst = status.latency_ms or (None, None)
+    e = now.estimate
+    states = [b.status for b in _estimates(now)]
+    counts = ", ".join(f"{states.count(s)} {html.escape(s)}" for s in dict.fromkeys(states))
+    speed = float(np.hypot(*np.asarray(e.velocity, float)))
+    rates = [(name, page.figure(rate, "Hz", 1), "measurements a second") for name, rate in status.rates.items()]
+    dropped = sum(status.dropped.values())
+    reasons = ", ".join(f"{count} {html.escape(why)}" for why, count in sorted(status.dropped.items()))
+    return [
+        ("Time", page.figure(now.t, "s", 1), html.escape(now.status)),
+        ("Beacons placed", str(int(np.sum(e.active)) - 1), counts),
+        ("Speed", page.figure(speed, "m/s", 2), f"match score {page.figure(float(e.score), '', 2)}"),
+        ("Arrival to pose", page.figure(median, "ms", 1), f"99 % {page.figure(worst, 'ms', 1)}"),
+        *((html.escape(name), value, note) for name, value, note in rates),
+        ("Dropped", str(dropped), reasons or "nothing"),
+    ]
