@@ -12,7 +12,7 @@ import importlib
 import sys
 
 from benchmarks.metric import judge, publish
-from uwbslam_jax.__main__ import prepare
+from uwbslam_jax.process import prepare
 
 NAMES = {
     "step": "one online step beside KISS-ICP on the same scans",

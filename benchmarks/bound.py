@@ -22,13 +22,10 @@ from jax import lax
 from benchmarks.bound_fused import fused
 from benchmarks.bound_recursion import Covariances, recursion
 from benchmarks.metric import Metric, Report
-from uwbslam_jax.estimator import state_vector
-from uwbslam_jax.estimator import motion
-from uwbslam_jax.estimator import ranging
-from uwbslam_jax.estimator import match_fusion
-from uwbslam_jax.settings import Settings, UwbSettings, make_config, make_params
-from uwbslam_jax.numerics.gaussian import Gaussian, symmetric_root
+from uwbslam_jax.estimator import match_fusion, motion, ranging, state_vector
 from uwbslam_jax.measurements import Ranges, empty_frame
+from uwbslam_jax.numerics.gaussian import Gaussian, symmetric_root
+from uwbslam_jax.settings import Settings, UwbSettings, make_config, make_params
 
 RUNS = 50
 _STEPS, _DT = 600, 0.1

@@ -9,13 +9,13 @@ import numpy as np
 
 from benchmarks.bound_recursion import recursion
 from benchmarks.metric import Metric
-from uwbslam_jax.estimator import match_fusion
-from uwbslam_jax.sim.scenario import Scenario
-from uwbslam_jax.settings import MapSettings
-from uwbslam_jax.evaluation import align, wrap
-from uwbslam_jax.sim.rays import strike
 from uwbslam_jax.api import run_messages
+from uwbslam_jax.estimator import match_fusion
+from uwbslam_jax.evaluation import align, wrap
 from uwbslam_jax.files.settings_file import from_dict
+from uwbslam_jax.settings import MapSettings
+from uwbslam_jax.sim.rays import strike
+from uwbslam_jax.sim.scenario import Scenario
 from uwbslam_jax.sim.simulate import scenario, settings_overrides, simulate
 
 _FIRST_SEED, _SECONDS = 500, 60.0

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from uwbslam_jax.sim.scenario import Interval
 from uwbslam_jax.evaluation import wrap
+from uwbslam_jax.sim.scenario import Interval
 
 NAN = float("nan")
 _PUT_DOWN_S = 10.0

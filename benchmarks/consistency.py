@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.tables import cell, line, provenance, write
-from uwbslam_jax.__main__ import prepare
+from uwbslam_jax.process import prepare
 
 BOUNDS = (0.3, 2.0)
 """Between these the mean NEES over its degrees of freedom has to lie."""

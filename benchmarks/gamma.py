@@ -14,14 +14,14 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.metric import Metric, Report
-from uwbslam_jax.sim import worlds
-from uwbslam_jax.sim.scenario import Beacon, Lidar, Scenario, Uwb, stream
-from uwbslam_jax.settings import FilterSettings, Settings
+from uwbslam_jax.api import run_messages
 from uwbslam_jax.evaluation import evaluate
+from uwbslam_jax.settings import FilterSettings, Settings
+from uwbslam_jax.sim import worlds
+from uwbslam_jax.sim.catalogue import scenario, spread
 from uwbslam_jax.sim.paths import Along, Rest, Track
 from uwbslam_jax.sim.paths import Path as Way
-from uwbslam_jax.api import run_messages
-from uwbslam_jax.sim.catalogue import scenario, spread
+from uwbslam_jax.sim.scenario import Beacon, Lidar, Scenario, Uwb, stream
 from uwbslam_jax.sim.simulate import simulate
 
 GAMMAS = (1e-6, 0.01, 0.1, 0.65, 3.0, 15.0, 100.0)

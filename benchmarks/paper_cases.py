@@ -9,11 +9,11 @@ import numpy as np
 
 from benchmarks import intervals
 from benchmarks.trials import Outcome, measure
-from uwbslam_jax.sim.scenario import Scenario
-from uwbslam_jax.settings import FilterSettings, Settings
 from uwbslam_jax.evaluation import rigid_fit, wrap
-from uwbslam_jax.sim.paths import Along, Path, Rest, Track
 from uwbslam_jax.result import MapImage, Result
+from uwbslam_jax.settings import FilterSettings, Settings
+from uwbslam_jax.sim.paths import Along, Path, Rest, Track
+from uwbslam_jax.sim.scenario import Scenario
 from uwbslam_jax.sim.simulate import scenario
 
 LENGTH = 22.7

@@ -10,8 +10,8 @@ import numpy as np
 
 from benchmarks import paper_cases as cases
 from benchmarks.paper_cases import Case, Seen
-from uwbslam_jax.files.run_folder import trinary
 from uwbslam_jax.plotting import show_map, show_track
+from uwbslam_jax.result import trinary
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from uwbslam_jax.settings import MapSettings, RobotSettings, Settings, UwbSettings
 from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, TruthMessage
+from uwbslam_jax.settings import MapSettings, RobotSettings, Settings, UwbSettings
 
 LIGHT = 299.792458
 """Speed of light [m/us]."""

@@ -11,7 +11,7 @@ import dataclasses
 from pathlib import Path
 
 from benchmarks.tables import cell, line, provenance, write
-from uwbslam_jax.__main__ import prepare
+from uwbslam_jax.process import prepare
 
 _COLUMNS = {
     "robot_rmse_m": ("robot RMS [m]", 3),
@@ -31,11 +31,11 @@ _COLUMNS = {
 def measure(log: Path, *, odometry: bool) -> dict[str, float | None]:
     """Figures of one run of a recording."""
     from benchmarks.sharpness import scan_misfit
-    from uwbslam_jax.settings import OdomSettings, Settings
+    from uwbslam_jax.api import run_log
+    from uwbslam_jax.evaluation import Truth, consistency, evaluate
     from uwbslam_jax.files.mcap_log import LogReader
     from uwbslam_jax.measurements import ScanMessage
-    from uwbslam_jax.evaluation import Truth, consistency, evaluate
-    from uwbslam_jax.api import run_log
+    from uwbslam_jax.settings import OdomSettings, Settings
 
     settings = dataclasses.replace(Settings(), odom=OdomSettings(use=odometry))
     result, _ = run_log(log, settings)

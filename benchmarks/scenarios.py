@@ -18,7 +18,7 @@ from typing import Any
 from benchmarks.sharpness import STRAY_M
 from benchmarks.suite import ROWS, STRAY, Row
 from benchmarks.tables import cell, line, plain, provenance, write
-from uwbslam_jax.__main__ import prepare
+from uwbslam_jax.process import prepare
 
 Seed = dict[str, Any]
 """One seed's figures: those of `trials.measure`, `seed`, `load`, `checks` (name -> figure) and `failed` (in words)."""

@@ -6,10 +6,9 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from uwbslam_jax.measurements import ScanMessage
 from uwbslam_jax.evaluation import RigidMotion, rigid_fit
-from uwbslam_jax.files.run_folder import OCCUPIED_THRESHOLD
-from uwbslam_jax.result import MapImage
+from uwbslam_jax.measurements import ScanMessage
+from uwbslam_jax.result import OCCUPIED_THRESHOLD, MapImage
 
 _FITTED = 2000
 """Cells that take part in a map's own fit, evenly."""

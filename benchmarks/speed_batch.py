@@ -21,10 +21,10 @@ import numpy as np
 
 from benchmarks.metric import Metric, Report, ratio
 from benchmarks.speed_scaling import Case, sized
-from uwbslam_jax.settings import MapSettings, Settings, UwbSettings
-from uwbslam_jax.session.frame_assembler import FrameAssembler
 from uwbslam_jax.files.mcap_log import LogReader
+from uwbslam_jax.session.frame_assembler import FrameAssembler
 from uwbslam_jax.session.session import Session
+from uwbslam_jax.settings import MapSettings, Settings, UwbSettings
 
 _SETS = (1, 4, 16, 64)
 _STEPS = 20

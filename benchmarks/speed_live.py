@@ -19,11 +19,11 @@ import numpy as np
 from mcap.reader import make_reader
 
 from benchmarks.metric import Metric, Report
-from uwbslam_jax.settings import LidarSettings
-from uwbslam_jax.files.mcap_log import LogReader
 from uwbslam_jax.evaluation import Truth, evaluate
+from uwbslam_jax.files.mcap_log import LogReader
 from uwbslam_jax.files.run_folder import read_run, read_trajectory
 from uwbslam_jax.live.recorder import DROPPED
+from uwbslam_jax.settings import LidarSettings
 
 _WORDS = [sys.executable, "-m", "uwbslam_jax"]
 _SETTLED_S = 120.0
@@ -178,8 +178,8 @@ def _emulated(folder: Path, truth: Path) -> Iterator[tuple[str, str]]:
 
 def _robot_of_the_workshop(folder: Path) -> Path:
     """A settings file with what a user would configure for this robot."""
-    from uwbslam_jax.sim.scenario import settings_overrides
     from uwbslam_jax.files.settings_file import dump, from_dict
+    from uwbslam_jax.sim.scenario import settings_overrides
     from uwbslam_jax.sim.simulate import scenario
 
     path = folder / "robot.toml"

@@ -15,11 +15,10 @@ import numpy as np
 from jax import lax
 
 from benchmarks.metric import Metric, Report, exponent, ratio
-from uwbslam_jax.estimator import compiled
-from uwbslam_jax.estimator import state_vector
-from uwbslam_jax.estimator import step
-from uwbslam_jax.settings import Config, LidarSettings, MapSettings, Settings, UwbSettings, make_config, make_params
+from uwbslam_jax import estimator
+from uwbslam_jax.estimator import compiled, state_vector
 from uwbslam_jax.measurements import Frame, Ranges, Scan, empty_frame
+from uwbslam_jax.settings import Config, LidarSettings, MapSettings, Settings, UwbSettings, make_config, make_params
 
 BEACONS = (3, 5, 10, 20, 50)
 BEAMS = (181, 361, 541, 1081, 2162)
@@ -75,7 +74,7 @@ class Case:
         self._params = make_params(settings)
         around = 2 * np.pi * np.arange(k) / k
         self._nodes = np.column_stack([5.5 * np.cos(around), 3.5 * np.sin(around)])
-        state = step.init(self._config)
+        state = estimator.init(self._config)
         mean = state.belief.mean.at[2 : 2 * k].set(jnp.asarray(self._nodes[1:].ravel(), jnp.float32))
         at = jnp.arange(2, 2 * k)
         cov = state.belief.cov.at[at, at].set(1e-2).at[at + 2 * k, at + 2 * k].set(1e-8)
@@ -114,7 +113,7 @@ class Case:
         start = self.state
 
         def one(params):
-            state, told = lax.scan(partial(step.step, self._config, params), start, stacked)
+            state, told = lax.scan(partial(estimator.step, self._config, params), start, stacked)
             return state_vector.robot_pose(state.belief.mean), jnp.sum(told.log_likelihood)
 
         run = jax.jit(jax.vmap(one))

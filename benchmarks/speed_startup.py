@@ -15,7 +15,7 @@ from benchmarks.metric import Metric, Report, ratio
 
 _CHILD = """
 import sys, time
-from uwbslam_jax.__main__ import prepare
+from uwbslam_jax.process import prepare
 prepare()
 from uwbslam_jax import commands
 from uwbslam_jax.config import Settings

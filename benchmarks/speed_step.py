@@ -12,20 +12,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.metric import Metric, Report, ratio, spread
-from uwbslam_jax.estimator import compiled
-from uwbslam_jax.mapping import grid
-from uwbslam_jax.estimator import state_vector
-from uwbslam_jax.estimator import motion
-from uwbslam_jax.estimator import ranging
-from uwbslam_jax.estimator import step
-from uwbslam_jax.mapping import sweep
-from uwbslam_jax.settings import Settings
-from uwbslam_jax.session.frame_assembler import FrameAssembler
-from uwbslam_jax.numerics.se2 import rotation
-from uwbslam_jax.measurements import StampedFrame
-from uwbslam_jax.api import fit_beams
-from uwbslam_jax.session.session import Session
+from uwbslam_jax.estimator import compiled, motion, ranging, state_vector
+from uwbslam_jax.estimator import step as step_module
 from uwbslam_jax.files.settings_file import from_dict
+from uwbslam_jax.mapping import grid
+from uwbslam_jax.mapping.sweep import undo_motion
+from uwbslam_jax.measurements import StampedFrame
+from uwbslam_jax.numerics.se2 import rotation
+from uwbslam_jax.session.frame_assembler import FrameAssembler
+from uwbslam_jax.session.runner import fit_beams
+from uwbslam_jax.session.session import Session
+from uwbslam_jax.settings import Settings
 from uwbslam_jax.sim.simulate import scenario, settings_overrides, simulate
 
 _SECONDS = 150.0
@@ -121,8 +118,8 @@ def _parts(run: Session, frames: list[StampedFrame]) -> list[tuple[str, float]]:
     config, params, frame = run.config, run.params, jax.tree.map(jnp.asarray, frames[-1].frame)
     state = run.state
     s = state_vector.unpack(state.belief.mean)
-    sweep = step.undo_motion(frame.scan, params.lidar, rotation(-s.heading) @ s.velocities[0], s.yaw_rate)
-    usable = step._usable(config, state, frame)
+    sweep = undo_motion(frame.scan, params.lidar, rotation(-s.heading) @ s.velocities[0], s.yaw_rate)
+    usable = step_module._usable(config, state, frame)
 
     def filtered(state, frame):
         belief = motion.predict(state.belief, params, frame.dt, frame.odometry, state.moving, state.unrest)
@@ -130,7 +127,7 @@ def _parts(run: Session, frames: list[StampedFrame]) -> list[tuple[str, float]]:
 
     def matched(state, sweep):
         surface = sweep.surface(sweep)
-        return step._match(config, params, state, state.belief, sweep, surface, frame.has_scan)
+        return step_module._match(config, params, state, state.belief, sweep, surface, frame.has_scan)
 
     def redrawn(window, pose):
         return grid.integrate(window, pose, sweep, config.resolution)

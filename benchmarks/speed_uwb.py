@@ -13,12 +13,10 @@ import numpy as np
 from jax import lax
 
 from benchmarks.metric import Metric, Report, ratio
-from uwbslam_jax.estimator import state_vector
-from uwbslam_jax.estimator import motion
-from uwbslam_jax.estimator import ranging
-from uwbslam_jax.estimator import step
-from uwbslam_jax.settings import Settings, UwbSettings, make_config, make_params
+from uwbslam_jax import estimator
+from uwbslam_jax.estimator import motion, ranging, state_vector
 from uwbslam_jax.measurements import Ranges, empty_frame
+from uwbslam_jax.settings import Settings, UwbSettings, make_config, make_params
 
 _BEACONS = np.array([[0.0, 0.0], [12.0, 0.0], [12.0, 19.0], [0.0, 19.0], [6.0, 9.0]])
 _PAIRS = np.array(list(combinations(range(6), 2)))
@@ -78,7 +76,7 @@ def _ours(track: np.ndarray, z: np.ndarray, guess: np.ndarray) -> list[Metric]:
     config, m = make_config(settings), len(_PAIRS)
     params = make_params(settings)._replace(sigma_w=jnp.float32(_SIGMA_W))
     frame = empty_frame(2, m)
-    first = step.init(config)
+    first = estimator.init(config)
     mean = first.belief.mean.at[:12].set(jnp.asarray(guess.ravel(), jnp.float32))
     spread = jnp.zeros(mean.shape[0]).at[:12].set(_GUESS_M**2).at[12:14].set(1.0).at[14:].set(1e-8)
     start = first._replace(belief=first.belief._replace(mean=mean, cov=jnp.diag(spread)), active=jnp.ones(6, bool))

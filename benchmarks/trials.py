@@ -15,13 +15,13 @@ from benchmarks.checks import NAN, Trial, rms_outside
 from benchmarks.intervals import disturbed
 from benchmarks.sharpness import occupied, own_fit, sharpness, stray, wall_distances
 from benchmarks.suite import Check
-from uwbslam_jax.sim.scenario import Scenario
-from uwbslam_jax.settings import Settings
-from uwbslam_jax.measurements import Message
-from uwbslam_jax.evaluation import RigidMotion, Truth, align, consistency, evaluate, wrap
-from uwbslam_jax.result import MapImage, Result
 from uwbslam_jax.api import run_messages
+from uwbslam_jax.evaluation import RigidMotion, Truth, align, consistency, evaluate, wrap
 from uwbslam_jax.files.settings_file import from_dict
+from uwbslam_jax.measurements import Message
+from uwbslam_jax.result import MapImage, Result
+from uwbslam_jax.settings import Settings
+from uwbslam_jax.sim.scenario import Scenario
 from uwbslam_jax.sim.simulate import START_NS, settings_overrides, simulate
 
 _MEMORY_SAMPLES = 100

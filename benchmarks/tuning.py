@@ -13,8 +13,8 @@ import numpy as np
 from benchmarks.metric import Metric, Report
 from benchmarks.tuning_cost import cost
 from benchmarks.tuning_links import links
-from uwbslam_jax.sim.scenario import Lidar, Scenario, Uwb, Wheels
 from uwbslam_jax.settings import Settings, UwbSettings
+from uwbslam_jax.sim.scenario import Lidar, Scenario, Uwb, Wheels
 from uwbslam_jax.sim.simulate import scenario, simulate
 
 _FIRST_SEED = 300
@@ -50,9 +50,9 @@ def measure(*, quick: bool) -> Report:
 
 def recovery(quick: bool) -> Iterator[Metric]:
     """Tuned sigma_n over the truth."""
+    from uwbslam_jax.tuning.fit import fit
     from uwbslam_jax.tuning.likelihood import Objective, piece
     from uwbslam_jax.tuning.rollout import prepare
-    from uwbslam_jax.tuning.fit import fit
 
     names, seconds = ("sigma_n", "sigma_w"), []
     for k, sigma in enumerate(_SIGMAS[: 1 if quick else None]):
@@ -85,9 +85,9 @@ def _pair(k: int) -> tuple[float, float, float]:
     """Gain in log-likelihood a frame, robot and beacons over what the defaults give."""
     from benchmarks.trials import measure as run
     from uwbslam_jax.tuning import parameters
+    from uwbslam_jax.tuning.fit import fit
     from uwbslam_jax.tuning.likelihood import Objective, piece
     from uwbslam_jax.tuning.rollout import prepare
-    from uwbslam_jax.tuning.fit import fit
 
     def hall(seed: int) -> Scenario:
         return replace(scenario("hall", seed, _SECONDS), uwb=Uwb(sigma=_TRUE_N))

@@ -13,8 +13,8 @@ import optimistix as optx
 from benchmarks.metric import Metric
 from benchmarks.public_logs import P2P_OFFSET, p2p
 from uwbslam_jax.estimator import ranging
-from uwbslam_jax.settings import Settings
 from uwbslam_jax.measurements import RangeMessage
+from uwbslam_jax.settings import Settings
 
 _DATA = Path(__file__).parents[2] / "shared" / "data" / "p2p"
 _FITTED = 0.75

@@ -15,8 +15,8 @@ import numpy as np
 from benchmarks import batch_solution
 from benchmarks.public_logs import DRIVEN, P2P_BAR_M, PublicLog, p2p
 from benchmarks.tables import cell, line
-from uwbslam_jax.evaluation import evaluate
 from uwbslam_jax.api import run_messages
+from uwbslam_jax.evaluation import evaluate
 
 _RANGE_SIGMA = {"plaza2": 0.6, "labyrinth": 0.1}
 """What the batch solution takes for the ranges' noise [m]."""

@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from uwbslam_jax.__main__ import prepare
+from uwbslam_jax.process import prepare
 
 # Before jax is imported, which reads these once. As the command line does it: sums over threads round differently.
 prepare()

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from uwbslam_jax.settings import Config
 from uwbslam_jax.measurements import Frame, Odometry, Ranges, Scan
+from uwbslam_jax.settings import Config
 
 CORNERS = np.array([[-4.0, -3.0], [4.5, -3.0], [4.5, 1.0], [2.0, 1.0], [2.0, 3.5], [-4.0, 3.5]]) + 0.05
 """An L-shaped room [m]: no rotation or reflection maps it to itself. Its walls run through middles of 0.1 m cells."""

@@ -6,10 +6,10 @@ from collections import deque
 
 import numpy as np
 
-from uwbslam_jax.settings import Settings, UwbSettings
-from uwbslam_jax.session.frame_assembler import pad_scan
-from uwbslam_jax.startup.keyframe_buffer import Buffer, Keyframe, Sighting
 from uwbslam_jax.measurements import Frame, Odometry, Ranges, StampedFrame
+from uwbslam_jax.session.frame_assembler import pad_scan
+from uwbslam_jax.settings import Settings, UwbSettings
+from uwbslam_jax.startup.keyframe_buffer import Buffer, Keyframe, Sighting
 
 BEACONS = {1: np.array([-2.0, 4.0]), 2: np.array([6.0, 5.0]), 3: np.array([5.0, -3.0])}
 IDS = {0: 0, 1: 1, 2: 2, 3: 3}

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 import small_room as room
 
-from uwbslam_jax.estimator import state_vector
-from uwbslam_jax.estimator import step
 from uwbslam_jax.beacons.keeper import BeaconKeeper
-from uwbslam_jax.settings import Params, Settings, UwbSettings, make_config, make_params
-from uwbslam_jax.session.frame_assembler import pad_scan
+from uwbslam_jax.estimator import init, state_vector
+from uwbslam_jax.estimator.state import Estimate, State
 from uwbslam_jax.measurements import Frame, StampedFrame
-from uwbslam_jax.estimator.step import Estimate, State
+from uwbslam_jax.session.frame_assembler import pad_scan
+from uwbslam_jax.settings import Params, Settings, UwbSettings, make_config, make_params
 
 SETTINGS = Settings(uwb=UwbSettings(max_beacons=3, sigma_n=0.1))
 CONFIG = make_config(SETTINGS)
@@ -30,7 +29,7 @@ def params(**changed) -> Params:
 
 def known(*slots: int) -> State:
     """A state that has some beacons at their places, known to a centimetre."""
-    state = step.init(CONFIG)
+    state = init(CONFIG)
     active = np.isin(np.arange(4), [0, *slots])
     s = state_vector.unpack(state.belief.mean)
     positions = jnp.asarray(np.where(active[:, None], BEACONS, 0.0), jnp.float32)

@@ -13,10 +13,10 @@ from benchmarks.checks import Stay, Trial
 from benchmarks.readme import section
 from benchmarks.scenarios import seed_table, summary_table, verdict, worst_and_median
 from benchmarks.suite import ROWS, Check, Row
-from uwbslam_jax.measurements import ScanMessage
 from uwbslam_jax.evaluation import RigidMotion
-from uwbslam_jax.sim.paths import Turn
+from uwbslam_jax.measurements import ScanMessage
 from uwbslam_jax.result import MapImage
+from uwbslam_jax.sim.paths import Turn
 from uwbslam_jax.sim.simulate import SCENARIOS, scenario
 
 T = np.arange(0.0, 60.0, 0.1)

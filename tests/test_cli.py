@@ -13,18 +13,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from uwbslam_jax.cli import commands
-from uwbslam_jax.files import settings_file
 from uwbslam_jax.__main__ import COMMANDS, main
-from uwbslam_jax.settings import Settings
-from uwbslam_jax.session.result_builder import Facts, to_result
-from uwbslam_jax.files.mcap_log import LogReader, LogWriter
-from uwbslam_jax.measurements import Message, RangeMessage, ScanMessage, TruthMessage
+from uwbslam_jax.api import run_log
+from uwbslam_jax.cli import commands
 from uwbslam_jax.evaluation import Truth
+from uwbslam_jax.files import settings_file
+from uwbslam_jax.files.mcap_log import LogReader, LogWriter
 from uwbslam_jax.files.run_folder import read_run
+from uwbslam_jax.measurements import Message, RangeMessage, ScanMessage, TruthMessage
 from uwbslam_jax.result import Result
-from uwbslam_jax.api import fit_beams, run_log
+from uwbslam_jax.session.result_builder import Facts, to_result
+from uwbslam_jax.session.runner import fit_beams
 from uwbslam_jax.session.session import CONTROL_EVERY, Session
+from uwbslam_jax.settings import Settings
 from uwbslam_jax.sim.simulate import scenario, settings_overrides, simulate
 
 BEAMS = 181

@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from uwbslam_jax import settings
+from uwbslam_jax.errors import ConfigError
 from uwbslam_jax.files import settings_file
-from uwbslam_jax.settings import ConfigError, Settings
+from uwbslam_jax.settings import Settings
 
 positive = st.floats(1e-6, 1e6)
 finite = st.floats(-1e6, 1e6)

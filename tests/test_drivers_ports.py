@@ -24,8 +24,8 @@ from uwbslam_drivers.emulators.serve import EMULATORS, Server
 from uwbslam_drivers.ports import SerialPort
 from uwbslam_drivers.source import Reading, parse_url
 from uwbslam_jax.__main__ import main
-from uwbslam_jax.measurements import RangeMessage, ScanMessage
 from uwbslam_jax.evaluation import Truth
+from uwbslam_jax.measurements import RangeMessage, ScanMessage
 from uwbslam_jax.sim.simulate import Scenario, scenario
 
 MS = 1_000_000

@@ -90,7 +90,9 @@ def test_a_state_known_exactly_stays_known_and_spoils_no_other():
     H = np.array([[1.0, 1.0, 0.0]])
     information, gradient = information_form(H, np.array([0.25]), np.array([2.0]))
     belief = Gaussian(jnp.zeros(3), jnp.asarray(cov, jnp.float32))
-    after = gaussian.update_information(belief, jnp.asarray(information, jnp.float32), jnp.asarray(gradient, jnp.float32))
+    after = gaussian.update_information(
+        belief, jnp.asarray(information, jnp.float32), jnp.asarray(gradient, jnp.float32)
+    )
     # by hand: the innovation of 2 is all the second state's; gain 1 / 1.25
     np.testing.assert_allclose(after.mean, [0.0, 1.6, 0.0], atol=1e-5)
     np.testing.assert_allclose(after.cov, np.diag([0.0, 0.2, 4.0]), atol=3e-5)  # 8 eps n of the largest

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uwbslam_jax.settings import LidarSettings, OdomSettings, Settings, UwbSettings
-from uwbslam_jax.session.frame_assembler import FrameAssembler, pad_scan
 from uwbslam_jax.measurements import OdometryMessage, RangeMessage, ScanMessage, StampedFrame, TruthMessage
+from uwbslam_jax.session.frame_assembler import FrameAssembler, pad_scan
+from uwbslam_jax.settings import LidarSettings, OdomSettings, Settings, UwbSettings
 
 NAN, INF = float("nan"), float("inf")
 START = 1_700_000_000_000_000_000

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from uwbslam_jax.backend.graph import Graph
-from uwbslam_jax.measurements import NAN, Scan
 from uwbslam_jax.backend.range_means import RangeMeans
+from uwbslam_jax.measurements import NAN, Scan
 
 SECOND = 1_000_000_000
 LENGTHS = np.full(40, 3000, np.uint16)

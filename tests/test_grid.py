@@ -13,9 +13,9 @@ import small_room as room
 from derivatives import assert_gradient, double
 
 from uwbslam_jax.mapping import grid as occupancy
+from uwbslam_jax.mapping.grid import CLAMP, EPOCH_LEVEL, FREE, FREE_REACH_M, HIT, Grid
+from uwbslam_jax.mapping.sweep import Sweep, undo_motion
 from uwbslam_jax.numerics.se2 import transform_points
-from uwbslam_jax.mapping.grid import CLAMP, EPOCH_LEVEL, FREE, FREE_REACH_M, HIT, Grid, Sweep
-from uwbslam_jax.estimator.step import undo_motion
 
 CELLS, LEVELS, RESOLUTION = 64, 2, 0.2
 

@@ -9,13 +9,14 @@ import pytest
 import small_room as room
 from test_session import BEACONS, SETTINGS, Drive, assert_same_bits, pose_at
 
-from uwbslam_jax.settings import FilterSettings, UwbSettings
-from uwbslam_jax.backend.graph import KEYFRAME, Graph, wrapped
 from uwbslam_jax.backend.final_solution import Question, _track
-from uwbslam_jax.evaluation import rigid_fit
+from uwbslam_jax.backend.graph import KEYFRAME, Graph
 from uwbslam_jax.backend.range_means import RangeMeans
 from uwbslam_jax.backend.revision import Reviser
+from uwbslam_jax.evaluation import rigid_fit
+from uwbslam_jax.numerics.se2_host import wrapped
 from uwbslam_jax.session.session import CONTROL_EVERY, Session
+from uwbslam_jax.settings import FilterSettings, UwbSettings
 
 NODES = (10, 20, 30)
 BIAS = {10: 0.6, 20: -0.5, 30: 0.5}

@@ -24,8 +24,8 @@ from test_report import make_result
 
 from uwbslam_jax.__main__ import main
 from uwbslam_jax.files.mcap_log import LogReader
-from uwbslam_jax.measurements import ScanMessage
 from uwbslam_jax.files.run_folder import read_run, read_trajectory
+from uwbslam_jax.measurements import ScanMessage
 from uwbslam_jax.web.report import write_report
 
 PATIENCE_S = 120.0

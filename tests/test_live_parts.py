@@ -24,20 +24,20 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from uwbslam_drivers.device import DriverError
+from uwbslam_jax import estimator
+from uwbslam_jax.errors import RunError
 from uwbslam_jax.files import ros_types
-from uwbslam_jax.session import saved_state
-from uwbslam_jax.estimator import step
-from uwbslam_jax.settings import MapSettings, Settings, make_config
-from uwbslam_jax.session.frame_assembler import FrameAssembler
-from uwbslam_jax.live.message_queue import BEHIND_S, MOST, OVERFULL, OVERTAKEN, Arrival, Inbox
-from uwbslam_jax.web.live_page import LivePage, Status
-from uwbslam_jax.web.server import LiveView, parse_address
 from uwbslam_jax.files.mcap_log import LogReader, LogWriter
+from uwbslam_jax.live.message_queue import BEHIND_S, MOST, OVERFULL, OVERTAKEN, Arrival, Inbox
+from uwbslam_jax.mapping.tiled_map import TILE, Tiles
 from uwbslam_jax.measurements import Message, RangeMessage, ScanMessage
-from uwbslam_jax.files.run_folder import RunError
+from uwbslam_jax.session import saved_state
+from uwbslam_jax.session.frame_assembler import FrameAssembler
 from uwbslam_jax.session.saved_state import Locator, Saved
 from uwbslam_jax.session.session import Session
-from uwbslam_jax.mapping.tiled_map import TILE, Tiles
+from uwbslam_jax.settings import MapSettings, Settings, make_config
+from uwbslam_jax.web.live_page import LivePage, Status
+from uwbslam_jax.web.server import LiveView, parse_address
 
 SECOND = 1_000_000_000
 MS = 1_000_000
@@ -201,7 +201,7 @@ BEACONS = np.array([[0.0, 0.0], [6.0, 0.0], [2.0, 5.0], [7.0, 6.0]])
 def found_before() -> Saved:
     """A state with four beacons and a tile outside the window."""
     config = make_config(SMALL)
-    state = step.init(config)
+    state = estimator.init(config)
     mean, cov = np.array(state.belief.mean), np.array(state.belief.cov)
     for slot, place in enumerate(BEACONS, start=1):
         mean[2 * slot : 2 * slot + 2] = place
@@ -355,7 +355,7 @@ def test_published_poses_reach_a_foxglove_client() -> None:
 
     session = Session(SMALL)
     (frame,) = FrameAssembler(SMALL, session.config.max_ranges).add(scan(T0))
-    shapes = jax.eval_shape(partial(step.step, session.config), session.params, session.state, frame.frame)[1]
+    shapes = jax.eval_shape(partial(estimator.step, session.config), session.params, session.state, frame.frame)[1]
     estimate: Any = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
     estimate = estimate._replace(pose=np.array([1.25, -2.5, 0.5], np.float32))
     publisher = Publisher("127.0.0.1", 0)

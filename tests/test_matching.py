@@ -11,11 +11,10 @@ import pytest
 import small_room as room
 from derivatives import assert_gradient, double
 
-from uwbslam_jax.mapping import grid as occupancy
 from uwbslam_jax.estimator import matching
-from uwbslam_jax.mapping import sweep
+from uwbslam_jax.mapping import grid as occupancy
+from uwbslam_jax.mapping.sweep import undo_motion
 from uwbslam_jax.numerics.gaussian import Gaussian
-from uwbslam_jax.estimator.step import undo_motion
 
 CELLS, LEVELS, RESOLUTION, BEAMS = 128, 3, 0.1, 180
 SIGMA_L = 0.25

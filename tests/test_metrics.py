@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 from uwbslam_jax import evaluation
-from uwbslam_jax.measurements import TruthMessage
 from uwbslam_jax.evaluation import Truth
+from uwbslam_jax.measurements import TruthMessage
 from uwbslam_jax.result import BeaconEstimate, MapImage, Result
 
 EXACT = 1e-9  # rounding of a few float64 operations on numbers below 100

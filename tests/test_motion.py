@@ -11,12 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from uwbslam_jax.estimator import state_vector
-from uwbslam_jax.estimator import motion
-from uwbslam_jax.settings import Params, Settings, UwbSettings, make_params
-from uwbslam_jax.numerics.gaussian import Gaussian
+from uwbslam_jax.estimator import motion, state_vector
 from uwbslam_jax.estimator.state_vector import Nodes
 from uwbslam_jax.measurements import Odometry
+from uwbslam_jax.numerics.gaussian import Gaussian
+from uwbslam_jax.settings import Params, Settings, UwbSettings, make_params
 
 NODES = 3
 SIZE = state_vector.state_size(NODES)

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from derivatives import assert_gradient, double
 
+from uwbslam_jax.estimator import lidar_objective, matching
 from uwbslam_jax.mapping import grid as occupancy
-from uwbslam_jax.estimator import matching
-from uwbslam_jax.estimator import lidar_objective
 from uwbslam_jax.numerics.se2 import transform_points
 
 CELLS, SIZE, BEAMS = 40, 0.2, 60

@@ -13,8 +13,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uwbslam_jax.files.run_folder import RunError, read_run, read_trajectory, trinary, write_result, write_trajectory
-from uwbslam_jax.result import BeaconEstimate, MapImage, Result
+from uwbslam_jax.errors import RunError
+from uwbslam_jax.files.run_folder import read_run, read_trajectory, write_result, write_trajectory
+from uwbslam_jax.result import BeaconEstimate, MapImage, Result, trinary
 
 T0 = 1_700_000_000_123_456_789  # ns; no float64 holds it
 FRAMES = 60

@@ -6,8 +6,8 @@ import jax
 import numpy as np
 import pytest
 
+from uwbslam_jax.estimator.compiled import Packing
 from uwbslam_jax.measurements import Frame, empty_frame
-from uwbslam_jax.estimator.packing import Packing
 
 
 def frame(seed: int) -> Frame:

@@ -9,15 +9,12 @@ import pytest
 import small_room as room
 from derivatives import assert_gradient, double
 
+from uwbslam_jax.estimator import matching, paper, ranging, state_vector
+from uwbslam_jax.estimator.state_vector import Nodes
 from uwbslam_jax.mapping import grid as occupancy
-from uwbslam_jax.estimator import state_vector
-from uwbslam_jax.estimator import matching
-from uwbslam_jax.estimator import paper
-from uwbslam_jax.estimator import ranging
-from uwbslam_jax.settings import Settings, UwbSettings, make_params
 from uwbslam_jax.numerics.gaussian import Gaussian
 from uwbslam_jax.numerics.se2 import rotation, transform_points
-from uwbslam_jax.estimator.state_vector import Nodes
+from uwbslam_jax.settings import Settings, UwbSettings, make_params
 
 NODES, GAMMA = 4, 20.0
 SIZE = state_vector.state_size(NODES)
@@ -189,7 +186,9 @@ def test_heading_is_the_direction_of_motion_and_stays_at_rest():
     still = state_vector.pack(s._replace(velocities=jnp.zeros((NODES, 2))))
     resting = paper.heading_from_velocity(Gaussian(still, jnp.eye(SIZE)))
     assert float(state_vector.unpack(resting.mean).heading) == float(s.heading)
-    slope = jax.grad(lambda x: state_vector.unpack(paper.heading_from_velocity(Gaussian(x, jnp.eye(SIZE))).mean).heading)
+    slope = jax.grad(
+        lambda x: state_vector.unpack(paper.heading_from_velocity(Gaussian(x, jnp.eye(SIZE))).mean).heading
+    )
     assert np.isfinite(slope(still)).all()
 
 

@@ -10,9 +10,10 @@ import pytest
 import start_of_run
 from scipy.optimize import least_squares
 
+from uwbslam_jax.numerics import multilateration, robust
+from uwbslam_jax.numerics.robust import CALIBRATED_M
 from uwbslam_jax.startup import hypotheses
-from uwbslam_jax.numerics import multilateration
-from uwbslam_jax.startup.placement import CALIBRATED_M, Problem
+from uwbslam_jax.startup.placement import Problem
 
 
 def problem(poses=None, **options) -> Problem:
@@ -117,13 +118,13 @@ def test_mirror_of_a_straight_track_explains_the_ranges_as_well():
     found = p.minimise(truth())
     mirrored = p.minimise(*p.images(found)[0])
     np.testing.assert_allclose(mirrored.beacons, truth() * [1, -1], atol=0.3)
-    assert abs(found.cost - mirrored.cost) < multilateration.DECIDED
+    assert abs(found.cost - mirrored.cost) < robust.DECIDED
 
 
 def test_mirror_of_a_track_with_a_turn_does_not():
     p = problem()
     found = p.minimise(truth())
-    assert p.minimise(*p.images(found)[0]).cost - found.cost > 10 * multilateration.DECIDED
+    assert p.minimise(*p.images(found)[0]).cost - found.cost > 10 * robust.DECIDED
 
 
 def test_starts_put_all_beacons_on_consistent_sides():

@@ -14,13 +14,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import norm
 
-from uwbslam_jax.estimator import state_vector
-from uwbslam_jax.estimator import motion
-from uwbslam_jax.estimator import ranging
-from uwbslam_jax.settings import Params, Settings, UwbSettings, make_params
-from uwbslam_jax.numerics.gaussian import Gaussian
+from uwbslam_jax.estimator import motion, ranging, state_vector
 from uwbslam_jax.estimator.state_vector import Nodes
 from uwbslam_jax.measurements import Odometry, Ranges
+from uwbslam_jax.numerics.gaussian import Gaussian
+from uwbslam_jax.settings import Params, Settings, UwbSettings, make_params
 
 NODES = 4
 SIZE = state_vector.state_size(NODES)

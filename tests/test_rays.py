@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from uwbslam_jax.sim import rays
-from uwbslam_jax.sim import worlds
+from uwbslam_jax.sim import rays, worlds
 
 
 def test_cast_in_a_square_room_is_analytic() -> None:

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import small_room as room
 
-from uwbslam_jax.settings import Settings, make_params
-from uwbslam_jax.measurements import Snapshot
 from uwbslam_jax.backend.registration import Registration, register, view
+from uwbslam_jax.measurements import Snapshot
+from uwbslam_jax.settings import Settings, make_params
 
 PARAMS = make_params(Settings())
 BEAMS = 360

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from uwbslam_jax.web.report import write_report
 from uwbslam_jax.result import BeaconEstimate, MapImage, Result
+from uwbslam_jax.web.report import write_report
 
 START = 1_700_000_000_000_000_000
 MEGABYTE = 1 << 20

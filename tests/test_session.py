@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 import small_room as room
 
-from uwbslam_jax.estimator import compiled
-from uwbslam_jax.estimator import step
+from uwbslam_jax.estimator import compiled, init
 from uwbslam_jax.estimator.compiled import TRACES
-from uwbslam_jax.settings import FilterSettings, LidarSettings, MapSettings, Settings, UwbSettings
 from uwbslam_jax.measurements import StampedFrame
 from uwbslam_jax.session.session import CONTROL_EVERY, Session
+from uwbslam_jax.settings import FilterSettings, LidarSettings, MapSettings, Settings, UwbSettings
 
 SETTINGS = Settings(
     uwb=UwbSettings(max_beacons=3, sigma_n=0.05),
@@ -148,7 +147,7 @@ def test_compiled_steps_give_the_same_bits_with_beacons_in_the_state():
     frames[5] = replace(frames[5], frame=room.frame(run.config, 0.1, None, frames[5].frame.ranges))
 
     def start():
-        state = step.init(run.config)
+        state = init(run.config)
         first = pose_at(0.0)
         c, s = np.cos(first[2]), np.sin(first[2])
         seen = np.array([(b - first[:2]) @ np.array([[c, -s], [s, c]]) for b in BEACONS.values()])

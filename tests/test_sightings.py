@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from uwbslam_jax.numerics import multilateration as m
 from uwbslam_jax.beacons import evidence as s
+from uwbslam_jax.numerics import multilateration as m
 
 PLACES = np.array([[0.0, 0.0], [6.0, 0.0], [0.0, 7.0], [8.0, 6.0], [-4.0, 5.0]])
 """Slot 0 is the robot's and not used; slot 3 is a node that may have been moved."""

@@ -12,11 +12,19 @@ from functools import cache
 import numpy as np
 import pytest
 
-from uwbslam_jax.sim import rays
-from uwbslam_jax.sim import worlds
 from uwbslam_jax.measurements import OdometryMessage, RangeMessage, ScanMessage, TruthMessage
+from uwbslam_jax.sim import rays, worlds
 from uwbslam_jax.sim.paths import Along, Carried, Path, Rest, Track, Turn
-from uwbslam_jax.sim.simulate import SCENARIOS, START_NS, Scenario, beacon_positions, scan_ranges, scenario, settings_overrides, simulate
+from uwbslam_jax.sim.simulate import (
+    SCENARIOS,
+    START_NS,
+    Scenario,
+    beacon_positions,
+    scan_ranges,
+    scenario,
+    settings_overrides,
+    simulate,
+)
 
 ready = cache(scenario)
 WITHOUT_SCANS = 1e-3

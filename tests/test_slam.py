@@ -11,12 +11,13 @@ import pytest
 import small_room as room
 from derivatives import assert_reverse, double, value_and_gradient
 
-from uwbslam_jax.mapping import grid as occupancy
+from uwbslam_jax import estimator
 from uwbslam_jax.estimator import state_vector
-from uwbslam_jax.estimator import step
-from uwbslam_jax.settings import Config, Params, Settings, UwbSettings, make_params
 from uwbslam_jax.estimator.state_vector import Nodes
+from uwbslam_jax.mapping import grid as occupancy
+from uwbslam_jax.mapping import undo_motion
 from uwbslam_jax.measurements import Odometry, Scan
+from uwbslam_jax.settings import Config, Params, Settings, UwbSettings, make_params
 
 BEAMS = 60
 CONFIG = Config(
@@ -39,11 +40,11 @@ BEACONS = np.array([[-3.5, -2.5], [4.0, -2.0], [1.0, 3.0]])
 PAIRS = room.all_pairs(4)
 POSE = np.array([0.33, -0.41, 0.6])
 
-step = jax.jit(step.step, static_argnums=0)
+step = jax.jit(estimator.step, static_argnums=0)
 
 
 def sweep_of(scan: Scan):
-    return step.undo_motion(jax.tree.map(jnp.asarray, scan), jnp.zeros(3), jnp.zeros(2), jnp.zeros(()))
+    return undo_motion(jax.tree.map(jnp.asarray, scan), jnp.zeros(3), jnp.zeros(2), jnp.zeros(()))
 
 
 @pytest.fixture(scope="module")
@@ -56,9 +57,9 @@ def room_map():
     return grid
 
 
-def knowing(grid, pose=POSE, velocity=(0.0, 0.0), yaw_rate=0.0, seed=0) -> step.State:
+def knowing(grid, pose=POSE, velocity=(0.0, 0.0), yaw_rate=0.0, seed=0) -> estimator.State:
     """A state in the middle of a run: the room drawn, three beacons placed, the robot near a pose."""
-    state = step.init(CONFIG)
+    state = estimator.init(CONFIG)
     positions = np.vstack([pose[:2], BEACONS])
     velocities = np.zeros((4, 2))
     velocities[0] = velocity
@@ -86,7 +87,7 @@ def measured(pose=POSE, dt=0.1, scan=True, noise=0.0, gap=np.nan, odometry=None,
 
 
 def test_first_step_starts_at_the_origin_and_draws_the_first_scan():
-    state, estimate = step(CONFIG, PARAMS, step.init(CONFIG), measured())
+    state, estimate = step(CONFIG, PARAMS, estimator.init(CONFIG), measured())
     np.testing.assert_allclose(estimate.pose, 0.0, atol=1e-4)
     assert bool(estimate.drawn)
     assert int(state.scans_drawn) == 1
@@ -175,7 +176,7 @@ def test_many_float32_steps_keep_the_covariance_healthy(room_map):
     frame = jax.tree.map(jnp.asarray, measured())
 
     def one(state, _):
-        state, _ = step.step(FLAT, PARAMS, state, frame)
+        state, _ = estimator.step(FLAT, PARAMS, state, frame)
         P = state.belief.cov
         scale = jnp.sqrt(jnp.diagonal(P))
         correlation = P / (scale[:, None] * scale[None, :])
@@ -202,7 +203,7 @@ def test_each_beam_is_placed_at_its_own_time():
         np.float32(dt),
     )
     as_jax = [jnp.asarray(x, jnp.float32) for x in (lidar, velocity, yaw_rate)]
-    sweep = step.undo_motion(jax.tree.map(jnp.asarray, scan), *as_jax)
+    sweep = undo_motion(jax.tree.map(jnp.asarray, scan), *as_jax)
     for k in range(beams):
         t = k * dt
         a = lidar[2] - 1.0 + 0.05 * k
@@ -262,7 +263,7 @@ def test_gradient_of_a_whole_step_agrees_with_finite_differences(room_map):
     def value(at, frame):
         tunable, mean, root = at
         start = state._replace(belief=state.belief._replace(mean=mean, cov=root @ root.T))
-        after, estimate = step.step(FLAT, params._replace(**tunable), start, frame)
+        after, estimate = estimator.step(FLAT, params._replace(**tunable), start, frame)
         spread = weights @ after.belief.cov @ weights
         decided = estimate.searched | estimate.poor
         total = weights @ after.belief.mean + spread + 0.1 * estimate.log_likelihood + estimate.score
@@ -291,7 +292,7 @@ def test_gradient_through_a_first_scan_that_is_drawn_is_finite():
     def value(at):
         tunable, mean = at
         start = state._replace(belief=state.belief._replace(mean=mean))
-        after, estimate = step.step(FLAT, params._replace(**tunable), start, frame)
+        after, estimate = estimator.step(FLAT, params._replace(**tunable), start, frame)
         total = jnp.sum(after.belief.mean) + jnp.sum(after.grid.levels[0]) - estimate.log_likelihood
         return jnp.where(estimate.drawn, total, jnp.nan)  # it is drawn
 

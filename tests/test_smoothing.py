@@ -7,9 +7,10 @@ from collections import deque
 import numpy as np
 
 from uwbslam_jax.backend import smoothing
-from uwbslam_jax.numerics import sparse_least_squares
-from uwbslam_jax.backend.graph import Graph, relative
+from uwbslam_jax.backend.graph import Graph
 from uwbslam_jax.backend.range_means import RangeMeans
+from uwbslam_jax.numerics import sparse_least_squares
+from uwbslam_jax.numerics.se2_host import relative
 
 BEACONS = {1: np.array([-3.0, 5.0]), 2: np.array([9.0, 6.0]), 3: np.array([8.0, -4.0]), 4: np.array([-2.0, -3.0])}
 SIGMA_N = 0.1

@@ -10,13 +10,11 @@ import pytest
 import start_of_run
 from start_of_run import BEACONS, IDS, SETTINGS
 
-from uwbslam_jax.numerics import se2
-from uwbslam_jax.startup import keyframe_buffer
-from uwbslam_jax.estimator import state_vector
-from uwbslam_jax.estimator import step
-from uwbslam_jax.startup import decide
-from uwbslam_jax.settings import make_config, make_params
+from uwbslam_jax.estimator import init, state_vector
 from uwbslam_jax.mapping.tiled_map import Tiles
+from uwbslam_jax.numerics import se2, se2_host
+from uwbslam_jax.settings import make_config, make_params
+from uwbslam_jax.startup import adopt, decide
 
 TRUTH = np.array(list(BEACONS.values()))
 CONFIG, PARAMS = make_config(SETTINGS), make_params(SETTINGS)
@@ -78,7 +76,7 @@ def adopted_case():
     """A decided start, and a LiDAR-only state that has driven a little on from the last keyframe."""
     kept = start_of_run.buffer(start_of_run.with_a_turn())
     outcome = decide.solve(kept, IDS)
-    state = step.init(CONFIG)
+    state = init(CONFIG)
     pose = kept.keyframes[-1].pose + np.array([0.05, 0.1, 0.02])
     s = state_vector.unpack(state.belief.mean)
     mean = state_vector.pack(
@@ -94,7 +92,7 @@ def adopted_case():
     cov[np.ix_(at, at)] = MOTION_COV
     state = state._replace(belief=state.belief._replace(mean=mean, cov=jnp.asarray(cov)))
     frame_slots = decide.choose_frame(outcome.placement, IDS)
-    adopted = decide.adopt(CONFIG, PARAMS, state, Tiles(CONFIG.resolution), kept, outcome.placement, frame_slots)
+    adopted = adopt(CONFIG, PARAMS, state, Tiles(CONFIG.resolution), kept, outcome.placement, frame_slots)
     return outcome.placement, state, frame_slots, adopted, pose
 
 
@@ -114,7 +112,7 @@ def published(x: np.ndarray, onward: np.ndarray, frame: tuple[int, int]) -> np.n
 
 def test_adopted_state_is_the_start_in_the_published_frame():
     placement, state, frame, adopted, pose = adopted_case()
-    onward = decide.between(_last_key(), pose)
+    onward = se2_host.between(_last_key(), pose)
     want = published(np.concatenate([placement.poses[-1], placement.beacons.ravel()]), onward, frame)
     s = state_vector.unpack(adopted.state.belief.mean)
     np.testing.assert_allclose(s.positions[0], want[:2], atol=1e-4)  # float32 of some metres
@@ -140,7 +138,7 @@ def test_adopted_covariance_is_that_of_samples_put_through_the_change_of_frame()
     n = placement.poses.size
     x = np.concatenate([placement.poses[-1], placement.beacons.ravel()])
     cov = placement.cov[n - 3 :, n - 3 :]
-    onward = decide.between(_last_key(), pose)
+    onward = se2_host.between(_last_key(), pose)
     # a tenth of the spread, so that the map is linear over the samples
     samples = np.random.default_rng(0).multivariate_normal(x, cov / 100, 4000)
     mapped = np.array([published(sample, onward, frame) for sample in samples])
@@ -178,7 +176,7 @@ def test_earlier_poses_are_republished_with_the_keyframes_around_them():
     # a pose between two keyframes keeps its place relative to both, the nearer one counting more
     later = (track[3] + np.array([0.1, 0.02, 0.05]))[None]
     quarter = adopted.anchors[3:4] + (adopted.anchors[4] - adopted.anchors[3]) // 4
-    ends = [decide.compose(adopted.after[k], decide.between(track[k], later)) for k in (3, 4)]
+    ends = [se2_host.compose(adopted.after[k], se2_host.between(track[k], later)) for k in (3, 4)]
     np.testing.assert_allclose(adopted.republish(quarter, later), 0.75 * ends[0] + 0.25 * ends[1], atol=1e-9)
     # before the first keyframe: by the first
     first = adopted.republish(np.array([adopted.anchors[0] - 5]), track[:1])
@@ -190,8 +188,8 @@ def test_host_compose_and_between_are_those_of_the_device():
     rng = np.random.default_rng(0)
     a, b = rng.normal(size=(2, 3))
     device = se2.compose(jnp.asarray(a), jnp.asarray(b))
-    np.testing.assert_allclose(decide.compose(a, b), device, atol=1e-6)  # float32
-    np.testing.assert_allclose(decide.compose(a, decide.between(a, b)), b, atol=1e-12)
+    np.testing.assert_allclose(se2_host.compose(a, b), device, atol=1e-6)  # float32
+    np.testing.assert_allclose(se2_host.compose(a, se2_host.between(a, b)), b, atol=1e-12)
 
 
 def test_biased_radios_are_told():
@@ -211,9 +209,9 @@ def test_a_long_start_is_thinned_without_losing_ranges():
     averages = kept.averages(kept.keyframes)
     # each range still stands where it was taken, half of them now half-way between two keyframes
     poses = np.array([key.pose for key in kept.keyframes])
-    from_before = poses[averages.at, :2] + keyframe_buffer.turned(poses[averages.at, 2], averages.before)
+    from_before = poses[averages.at, :2] + se2_host.turned(poses[averages.at, 2], averages.before)
     after = np.minimum(averages.at + 1, len(poses) - 1)
-    from_after = poses[after, :2] + keyframe_buffer.turned(poses[after, 2], averages.after)
+    from_after = poses[after, :2] + se2_host.turned(poses[after, 2], averages.after)
     np.testing.assert_allclose(from_before, from_after, atol=1e-9)
     assert set(np.round(averages.share, 6)) == {0.0, 0.5}
 

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 import small_room as room
 
-from uwbslam_jax.estimator import state_vector
-from uwbslam_jax.estimator import match_fusion
-from uwbslam_jax.settings import Config, Params, Settings, UwbSettings, make_params
-from uwbslam_jax.numerics.gaussian import Gaussian
-from uwbslam_jax.estimator.state_vector import Nodes
+from uwbslam_jax.estimator import match_fusion, state_vector
 from uwbslam_jax.estimator.matching import Match
+from uwbslam_jax.estimator.state_vector import Nodes
+from uwbslam_jax.numerics.gaussian import Gaussian
+from uwbslam_jax.settings import Config, Params, Settings, UwbSettings, make_params
 
 BEACONS = np.array([[-3.5, -2.5], [4.0, -2.0], [1.0, 3.0]])
 NODES = 4
@@ -26,7 +25,11 @@ CALM = jnp.array(match_fusion.CALM) ** 2
 
 weigh, fuse, learn_unrest = jax.jit(match_fusion.weigh), jax.jit(match_fusion.fuse), jax.jit(match_fusion.learn_unrest)
 allow_jump, contradicted = jax.jit(match_fusion.allow_jump), jax.jit(match_fusion.contradicted)
-anchor, revisit, learn_spread = jax.jit(match_fusion.anchor), jax.jit(match_fusion.revisit), jax.jit(match_fusion.learn_spread)
+anchor, revisit, learn_spread = (
+    jax.jit(match_fusion.anchor),
+    jax.jit(match_fusion.revisit),
+    jax.jit(match_fusion.learn_spread),
+)
 AT, ERROR = np.array(state_vector.pose_indices(NODES)), np.array(state_vector.map_error_indices(NODES))
 
 
@@ -215,7 +218,9 @@ def spread(apart=0.0, views=1.0, way=50.0, epoch=20.0) -> match_fusion.MapSpread
     return match_fusion.MapSpread(apart * jnp.eye(3), jnp.float32(views), jnp.float32(way), jnp.float32(epoch))
 
 
-@pytest.mark.parametrize("seen", [0.0, 20.0, 20.0 + 0.9 * match_fusion._OTHER_EPOCH, 20.0 - 0.9 * match_fusion._OTHER_EPOCH])
+@pytest.mark.parametrize(
+    "seen", [0.0, 20.0, 20.0 + 0.9 * match_fusion._OTHER_EPOCH, 20.0 - 0.9 * match_fusion._OTHER_EPOCH]
+)
 def test_ground_of_the_same_epoch_or_of_none_errs_as_before(seen):
     before, known = uncertain(), spread(1e-4)
     after, still = revisit(before, known, jnp.float32(seen), PARAMS)

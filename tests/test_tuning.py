@@ -13,16 +13,13 @@ from test_slam import BEACONS, FLAT, PAIRS, PARAMS, knowing, room_map  # noqa: F
 from test_smoothing import ANTENNA, K, loop, make, solved
 from test_smoothing import BEACONS as SPOTS
 
-from uwbslam_jax.tuning import calibration
+from uwbslam_jax.errors import ConfigError
 from uwbslam_jax.estimator import ranging
-from uwbslam_jax.tuning import rollout
-from uwbslam_jax.tuning import parameters
-from uwbslam_jax.tuning import fit
-from uwbslam_jax.settings import ConfigError, Params, Settings
-from uwbslam_jax.backend.graph import relative
-from uwbslam_jax.tuning.likelihood import Objective, Score
 from uwbslam_jax.files.settings_file import differences, from_dict
-from uwbslam_jax.startup.decide import compose
+from uwbslam_jax.numerics.se2_host import compose, relative
+from uwbslam_jax.settings import Params, Settings
+from uwbslam_jax.tuning import calibration, fit, parameters, rollout
+from uwbslam_jax.tuning.likelihood import Objective, Score
 
 STEPS = 56
 """7 chunks of 8."""

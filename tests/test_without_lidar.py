@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from uwbslam_jax.__main__ import main
-from uwbslam_jax.settings import MapSettings, RobotSettings, Settings, UwbSettings
-from uwbslam_jax.files.mcap_log import LogWriter
-from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, TruthMessage
-from uwbslam_jax.files.run_folder import read_run
 from uwbslam_jax.api import run_messages
+from uwbslam_jax.files.mcap_log import LogWriter
+from uwbslam_jax.files.run_folder import read_run
+from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, TruthMessage
+from uwbslam_jax.settings import MapSettings, RobotSettings, Settings, UwbSettings
 
 START = 1_700_000_000_000_000_000
 SMALL = Settings(map=MapSettings(size_m=12.8))

@@ -9,10 +9,9 @@ import difflib
 import os
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 from uwbslam_jax import __version__
-from uwbslam_jax import process
+from uwbslam_jax.errors import UwbslamError
 
 COMMANDS = {
     "demo": "simulate a robot in a workshop, run the recording, and report",
@@ -44,7 +43,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         hint = f", did you mean {near[0]}?" if near else f"; there are {', '.join(COMMANDS)}"
         return _fail(f"no command {words[0]}{hint}")
     try:
-        prepare()
         from uwbslam_jax.cli import commands
 
         return _guarded(commands, words)
@@ -58,7 +56,7 @@ def _guarded(commands, words: list[str]) -> int:
         commands.call(words[0], words[1:])
     except BrokenPipeError:  # whoever reads our output has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except commands.USER_ERRORS as error:
+    except (UwbslamError, OSError) as error:
         return _fail(f"{error.filename}: {error.strerror}" if _names_file(error) else str(error))
     return 0
 
@@ -70,23 +68,6 @@ def _names_file(error: BaseException) -> bool:
 def _fail(text: str) -> int:
     print(f"uwbslam: {' '.join(text.split())}", file=sys.stderr)
     return BAD_INPUT
-
-
-def prepare() -> None:
-    """Settings of the process that the libraries read once, before they are imported.
-
-    Compiled programs are kept in the user's cache folder: the second run starts in seconds. LAPACK and XLA work alone:
-    LAPACK's threads spin over matrices of 40 rows and make a step many times slower than one thread does. Memory is
-    allocated from a few heaps, see `memory`.
-    """
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "uwbslam_jax" / "jax"
-    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache))
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # the same holds for XLA's kernels of a step, each of which takes microseconds
-    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
-    os.environ.setdefault("NPROC", "1")  # size of XLA's own thread pool
-    process.few_arenas()
 
 
 def usage() -> str:

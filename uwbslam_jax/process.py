@@ -1,13 +1,66 @@
-"""What the process asks of the C library's allocator, so that hours of running do not leave its memory in pieces."""
+"""Settings of the process that its libraries read once: threads, XLA's flags, the compilation cache, the heaps."""
 
 from __future__ import annotations
 
 import ctypes
+import os
 import sys
+import warnings
+from pathlib import Path
 
 _ARENA_MAX = -8
 """Number of the parameter in malloc.h."""
 _ARENAS = 2
+"""Heaps for all threads: one for the loop that steps, one for what runs beside it."""
+
+
+def prepare() -> None:
+    """Settings that the libraries read once. The package calls it when it is imported; what the user has set stays.
+
+    Compiled programs are kept in the user's cache folder: the second run starts in seconds. LAPACK and XLA work alone:
+    LAPACK's threads spin over matrices of 40 rows and make a step many times slower than one thread does, and sums over
+    threads round differently. Memory is allocated from a few heaps. Warns where JAX is at work already.
+    """
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "uwbslam_jax" / "jax"
+    told = "OPENBLAS_NUM_THREADS" in os.environ
+    wanted = {
+        "JAX_COMPILATION_CACHE_DIR": str(cache),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.2",
+        "OPENBLAS_NUM_THREADS": "1",
+        # the same holds for XLA's kernels of a step, each of which takes microseconds
+        "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false",
+        "NPROC": "1",  # size of XLA's own thread pool
+    }
+    missing = {name for name in wanted if name not in os.environ}
+    for name, value in wanted.items():
+        os.environ.setdefault(name, value)
+    if "numpy" in sys.modules and not told:  # it has read the variable already
+        import threadpoolctl
+
+        threadpoolctl.threadpool_limits(1, user_api="blas")
+    if "jax" in sys.modules:
+        _catch_up(missing)
+    few_arenas()
+
+
+def _catch_up(missing: set[str]) -> None:
+    """What JAX would have read of the variables, told to it after its import."""
+    import jax
+
+    if "JAX_COMPILATION_CACHE_DIR" in missing:
+        jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
+    if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" in missing:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+    from jax._src import xla_bridge  # there is no public way to ask
+
+    # XLA reads its flags with the first array
+    if missing & {"XLA_FLAGS", "NPROC"} and xla_bridge.backends_are_initialized():
+        warnings.warn(
+            "uwbslam_jax was imported after JAX had started: steps are slower, and round differently than the command "
+            "line's; import uwbslam_jax first",
+            RuntimeWarning,
+            stacklevel=3,
+        )
 
 
 def few_arenas() -> None:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+
+OCCUPIED_THRESHOLD = 0.65
+_OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,3 +77,22 @@ class Result:
     diagnostics: dict[str, np.ndarray] = field(default_factory=dict)
     events: list[tuple[int, str]] = field(default_factory=list)
     summary: dict[str, Any] = field(default_factory=dict)
+
+
+def crop(image: MapImage) -> MapImage:
+    """The smallest part of a map that holds every observed cell; a single unknown cell where there is none."""
+    rows, columns = (np.flatnonzero((image.log_odds != 0).any(axis=axis)) for axis in (1, 0))
+    if rows.size == 0:
+        return MapImage(np.zeros((1, 1), np.float32), image.resolution, np.asarray(image.origin, dtype=np.float64))
+    part = image.log_odds[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    origin = np.asarray(image.origin, dtype=np.float64) + image.resolution * np.array([columns[0], rows[0]])
+    return MapImage(part, image.resolution, origin)
+
+
+def trinary(log_odds: np.ndarray) -> np.ndarray:
+    """Gray values of map_server: 0 occupied (probability over 0.65), 254 free (seen, more free than not), 205 else.
+
+    A cell counts as free from its first miss on, as in HectorSLAM's published map: few beams cross a far cell twice.
+    """
+    occupied = log_odds > math.log(OCCUPIED_THRESHOLD / (1 - OCCUPIED_THRESHOLD))
+    return np.select([occupied, log_odds < 0], [_OCCUPIED, _FREE], _UNKNOWN).astype(np.uint8)

@@ -14,10 +14,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 
-class ConfigError(ValueError):
-    """A setting that is unknown, of the wrong type or out of range; the message is one line."""
-
-
 class Params(NamedTuple):
     """The tunable leaves, all differentiable. K = 1 + max_beacons slots, slot 0 is the robot.
 

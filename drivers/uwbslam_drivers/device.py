@@ -11,10 +11,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
+from uwbslam_jax.errors import UwbslamError
 from uwbslam_jax.measurements import RangeMessage, ScanMessage
 
 
-class DriverError(ValueError):
+class DriverError(UwbslamError, ValueError):
     """A URL, an option or a request that cannot be met; the message is one line."""
 
 

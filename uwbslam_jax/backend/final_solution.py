@@ -10,13 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uwbslam_jax.settings import Params
-from uwbslam_jax.backend.graph import Graph, relative, wrapped
-from uwbslam_jax.session.history import History
-from uwbslam_jax.startup.keyframe_buffer import turned
+from uwbslam_jax.backend.graph import Graph
 from uwbslam_jax.backend.range_means import Node
 from uwbslam_jax.backend.smoothing import Solution, solve
-from uwbslam_jax.startup.decide import compose, frame_motion, numeric_jacobian, published
+from uwbslam_jax.estimator.published_frame import frame_motion, published
+from uwbslam_jax.numerics.se2_host import compose, numeric_jacobian, relative, turned, wrapped
+from uwbslam_jax.settings import Params
 
 
 class Question(NamedTuple):
@@ -50,10 +49,16 @@ class Hindsight(NamedTuple):
     track: np.ndarray
 
 
-def look_back(question: Question, history: History) -> Hindsight | None:
-    """The run so far solved as a whole; None where it has too little of it."""
+def look_back(question: Question, stamps: np.ndarray, poses: np.ndarray, sight: np.ndarray) -> Hindsight | None:
+    """The run so far solved as a whole; None where it has too little of it.
+
+    Args:
+      stamps: (T,) of every frame [ns]; poses: (T, 3) where the map has them [m, m, rad]; sight: (T,) see state.sight.
+    """
     solution = framed_solution(question)
-    return None if solution is None else Hindsight(solution, _track(question.graph, history, solution.poses))
+    return (
+        None if solution is None else Hindsight(solution, _track(question.graph, solution.poses, stamps, poses, sight))
+    )
 
 
 def framed_solution(question: Question) -> Solution | None:
@@ -90,13 +95,12 @@ def _fit(poses: np.ndarray, onto: np.ndarray) -> np.ndarray:
     return np.append(onto[:, :2].mean(0) - turned(theta, poses[:, :2].mean(0)), theta)
 
 
-def _track(graph: Graph, history: History, after: np.ndarray) -> np.ndarray:
+def _track(graph: Graph, after: np.ndarray, stamps: np.ndarray, poses: np.ndarray, sight: np.ndarray) -> np.ndarray:
     """(T, 3) every frame's pose, from those of the keyframes before and after it.
 
     Where scans tell the position, the way between two keyframes is what the matches say; in a direction that a scan
     cannot see, it is even.
     """
-    stamps, poses = np.array(history.stamps), np.array(history.map_poses, float)
     keys, before, broken = graph.stamps(), graph.poses(), graph.keyframes["broken"]
     last = len(keys) - 1
     k = np.clip(np.searchsorted(keys, stamps, side="right") - 1, 0, last)
@@ -108,7 +112,6 @@ def _track(graph: Graph, history: History, after: np.ndarray) -> np.ndarray:
     track = ends[0] + share[:, None] * np.column_stack([ends[1][:, :2] - ends[0][:, :2], turn])
     even = after[k, :2] + share[:, None] * (after[n, :2] - after[k, :2])
     inside = (n > k)[:, None]
-    sight = np.array(history.sight)
     angle = np.where(np.isfinite(sight), sight, 0.0)
     axis = np.stack([np.cos(angle), np.sin(angle)], -1)
     apart = even - track[:, :2]

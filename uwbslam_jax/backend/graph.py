@@ -14,21 +14,19 @@ import jax
 import numpy as np
 from scipy import sparse
 
-from uwbslam_jax.numerics.row_buffer import Column
-from uwbslam_jax.settings import Config, Params
-from uwbslam_jax.startup.keyframe_buffer import turned
-from uwbslam_jax.measurements import Scan, Snapshot, StampedFrame
 from uwbslam_jax.backend.range_means import RangeMeans
 from uwbslam_jax.backend.registration import View, register, view
-from uwbslam_jax.estimator.step import Estimate
+from uwbslam_jax.estimator.state import Estimate, map_pose
+from uwbslam_jax.measurements import Scan, Snapshot, StampedFrame
+from uwbslam_jax.numerics.row_buffer import Column
+from uwbslam_jax.numerics.se2_host import relative, turned, wrapped
+from uwbslam_jax.settings import Config, Params
 
 _MOVED = (0.25, 0.2)
 """A keyframe every so much of way or turn [m, rad]."""
 _BLIND_S = 0.5
 _BLIND_M = 0.3
 """A keyframe also after this time where the scan tells the position no better than this."""
-_SEEN_M = 0.05
-"""A match that tells the position no better than this in some direction does not see it."""
 _FEWEST_RETURNS = 20
 """A scan of fewer returns tells nothing."""
 _ANCHOR_M = 2.0
@@ -282,34 +280,6 @@ class Graph:
             if len(others) >= _SCANS_OF_A_PLACE and spare:
                 self.scans[spare[0]] = None
                 self._kept.remove(spare[0])
-
-
-def map_pose(estimate: Estimate) -> np.ndarray:
-    """(3,) where the map has the robot: the match, or what was expected of it where nothing matched [m, m, rad]."""
-    if np.any(estimate.information):
-        return np.asarray(estimate.matched_pose, float)
-    return np.asarray(estimate.pose, float) + np.asarray(estimate.map_error, float)
-
-
-def sight(estimate: Estimate) -> float:
-    """What a match told of the position: NaN for all of it, inf for nothing, else the direction that it cannot see, in
-    the map's frame [rad]."""
-    (xx, xy), (_, yy) = estimate.information[:2, :2].tolist()
-    mean, spread = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)  # the eigenvalues are mean -+ spread
-    if mean - spread > _SEEN_M**-2:
-        return math.nan
-    along = 0.5 * math.atan2(2 * xy, xx - yy)  # where most is seen
-    return along + 0.5 * math.pi if mean + spread > _SEEN_M**-2 else math.inf
-
-
-def relative(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Poses b in the frames of poses a, both (..., 3); the angle is not wrapped."""
-    return np.concatenate([turned(-a[..., 2], b[..., :2] - a[..., :2]), b[..., 2:] - a[..., 2:]], axis=-1)
-
-
-def wrapped(angle):
-    """The same angles in [-pi, pi) [rad]."""
-    return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 def _blind(informed: np.ndarray) -> np.ndarray:

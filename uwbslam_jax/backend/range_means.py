@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from uwbslam_jax.estimator.state import Estimate
+from uwbslam_jax.measurements import StampedFrame
+from uwbslam_jax.numerics.robust import mean_sigma
 from uwbslam_jax.numerics.row_buffer import Column
 from uwbslam_jax.settings import Params
-from uwbslam_jax.startup.keyframe_buffer import mean_sigma
-from uwbslam_jax.measurements import StampedFrame
-from uwbslam_jax.estimator.step import Estimate
 
 _WINDOW = 21
 """So many ranges of a pair tell how much they scatter."""

@@ -12,11 +12,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from uwbslam_jax.settings import Params
-from uwbslam_jax.numerics.se2 import transform_points
+from uwbslam_jax.mapping.sweep import find_surface, stand_ins, undo_motion
 from uwbslam_jax.measurements import Snapshot
-from uwbslam_jax.estimator.step import undo_motion
-from uwbslam_jax.mapping.sweep import stand_ins, surface
+from uwbslam_jax.numerics.se2 import transform_points
+from uwbslam_jax.settings import Params
 
 _POINTS = 361
 """So many points of the newer scan take part at most."""
@@ -77,7 +76,7 @@ class Registration(NamedTuple):
 def view(params: Params, snapshot: Snapshot) -> View:
     """A scan made ready: done once, however often it is laid over others."""
     sweep = undo_motion(snapshot.scan, params.lidar, snapshot.drift, snapshot.yaw_rate)
-    walls = surface(sweep)
+    walls = find_surface(sweep)
     # a beam with a return speaks for itself, also where no surface was found; one without leaves it to a surface nearby
     nearest, near = stand_ins(walls.found)
     own = jnp.where(sweep.valid, jnp.arange(nearest.shape[0]), nearest)

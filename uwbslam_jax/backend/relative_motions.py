@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uwbslam_jax.backend.graph import Graph, relative, wrapped
-from uwbslam_jax.startup.keyframe_buffer import turned
+from uwbslam_jax.backend.graph import Graph
+from uwbslam_jax.numerics.se2_host import relative, turned, wrapped
 
 _LOOSE_WHEELS = (0.03, 0.06, 0.02, 0.06)
 """Standard deviation of a step by wheels: floor and share of the way [m], floor and share of the turn [rad]."""

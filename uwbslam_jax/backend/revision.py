@@ -14,19 +14,18 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from uwbslam_jax.estimator import state_vector
 from uwbslam_jax import process
-from uwbslam_jax.settings import Config, Params
-from uwbslam_jax.backend.graph import Graph, relative, wrapped
-from uwbslam_jax.mapping.grid import Grid
 from uwbslam_jax.backend.final_solution import Question, framed_solution
-from uwbslam_jax.numerics.multilateration import SIGMA_ENOUGH_M
-from uwbslam_jax.startup.placement import largest_sigma
-from uwbslam_jax.mapping.redraw import draw_onto, redraw
-from uwbslam_jax.estimator.step import State
+from uwbslam_jax.backend.graph import Graph
 from uwbslam_jax.backend.smoothing import Solution
-from uwbslam_jax.startup.decide import anchored, compose
-from uwbslam_jax.mapping.tiled_map import Tiles
+from uwbslam_jax.estimator import state_vector
+from uwbslam_jax.estimator.published_frame import anchored
+from uwbslam_jax.estimator.state import State
+from uwbslam_jax.mapping.grid import Grid
+from uwbslam_jax.mapping.tiled_map import Tiles, draw_onto, redraw
+from uwbslam_jax.numerics.robust import SIGMA_ENOUGH_M, largest_sigma
+from uwbslam_jax.numerics.se2_host import compose, relative, wrapped
+from uwbslam_jax.settings import Config, Params
 
 _LOOKS = 5
 """Looks of the host that the solution may take at least, and as many that the drawing may."""

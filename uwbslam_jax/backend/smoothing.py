@@ -13,12 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uwbslam_jax.backend.graph import Graph, relative, wrapped
-from uwbslam_jax.startup.keyframe_buffer import mean_sigma, turned
-from uwbslam_jax.numerics.multilateration import DECIDED, soften
+from uwbslam_jax.backend.graph import Graph
 from uwbslam_jax.backend.range_means import Node
-from uwbslam_jax.numerics.sparse_least_squares import Sink, blocks, covariance, elimination, minimise
 from uwbslam_jax.backend.relative_motions import even_drive, steps
+from uwbslam_jax.numerics.robust import DECIDED, mean_sigma, soften
+from uwbslam_jax.numerics.se2_host import relative, turned, wrapped
+from uwbslam_jax.numerics.sparse_least_squares import Sink, blocks, covariance, elimination, minimise
 
 CALIBRATED_M = 1e-3
 """Standard deviation of a node's bias when ranges are taken to be calibrated [m]."""

@@ -12,7 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uwbslam_jax.numerics.multilateration import DECIDED, RANGE_FLOOR_M, SIGMA_ENOUGH_M, Spot, fit, mirrored, misfit, multilaterate, settle
+from uwbslam_jax.numerics.multilateration import Spot, fit, mirrored, multilaterate, settle
+from uwbslam_jax.numerics.robust import DECIDED, RANGE_FLOOR_M, SIGMA_ENOUGH_M, misfit
 
 TIME, OTHER, X, Y, DISTANCE, NORMALISED = range(6)
 MEMORY_S = 40.0

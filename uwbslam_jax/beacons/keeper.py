@@ -13,13 +13,26 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from uwbslam_jax.beacons import state_edits
-from uwbslam_jax.estimator import ranging
-from uwbslam_jax.settings import Params, Settings
+from uwbslam_jax.beacons.evidence import (
+    DISTANCE,
+    MEMORY_S,
+    NORMALISED,
+    OTHER,
+    Known,
+    Sightings,
+    Verdict,
+    calm,
+    carried_place,
+    judge,
+    resting_elsewhere,
+    resting_place,
+)
 from uwbslam_jax.beacons.range_table import Heard, heard
+from uwbslam_jax.estimator import ranging
+from uwbslam_jax.estimator.state import Estimate, State
 from uwbslam_jax.measurements import StampedFrame
 from uwbslam_jax.numerics.multilateration import locate
-from uwbslam_jax.beacons.evidence import DISTANCE, MEMORY_S, NORMALISED, OTHER, Known, Sightings, Verdict, calm, carried_place, judge, resting_elsewhere, resting_place
-from uwbslam_jax.estimator.step import Estimate, State
+from uwbslam_jax.settings import Params, Settings
 
 _SILENT_S = 3.0
 _DROP_S = 60.0

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uwbslam_jax.settings import Params
+from uwbslam_jax.estimator.state import Estimate
 from uwbslam_jax.measurements import StampedFrame
-from uwbslam_jax.estimator.step import Estimate
+from uwbslam_jax.settings import Params
 
 
 class Heard(NamedTuple):

@@ -8,11 +8,12 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from uwbslam_jax.estimator import state_vector
-from uwbslam_jax.numerics.gaussian import Gaussian
-from uwbslam_jax.numerics.multilateration import RANGE_FLOOR_M, Spot
 from uwbslam_jax.beacons.evidence import OTHER, X, Y
-from uwbslam_jax.estimator.step import State
+from uwbslam_jax.estimator import state_vector
+from uwbslam_jax.estimator.state import State
+from uwbslam_jax.numerics.gaussian import Gaussian
+from uwbslam_jax.numerics.multilateration import Spot
+from uwbslam_jax.numerics.robust import RANGE_FLOOR_M
 
 _RESTING_SPEED = 1e-4
 """Standard deviation of the velocity of a node at rest [m/s]."""

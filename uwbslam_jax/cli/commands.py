@@ -16,29 +16,20 @@ import tyro
 from tqdm import tqdm
 from tyro.conf import Positional, arg
 
-from uwbslam_drivers.device import DriverError
 from uwbslam_drivers.emulators.command import EmulateOptions, emulate
-from uwbslam_jax.files import settings_file
-from uwbslam_jax.settings import ConfigError, Settings
+from uwbslam_jax.api import run_log
 from uwbslam_jax.cli.finish_run import accuracy, deliver, table
 from uwbslam_jax.cli.live_command import LiveOptions, live
+from uwbslam_jax.cli.tune_command import TuneOptions, tune
+from uwbslam_jax.errors import UsageError
+from uwbslam_jax.evaluation import Truth, evaluate
+from uwbslam_jax.files import settings_file
 from uwbslam_jax.files.log_summary import format_summary, inspect
 from uwbslam_jax.files.mcap_log import LogError, LogReader, LogWriter
+from uwbslam_jax.files.run_folder import read_run
 from uwbslam_jax.measurements import Message, ScanMessage, TruthMessage
-from uwbslam_jax.evaluation import Truth, evaluate
-from uwbslam_jax.files.run_folder import RunError, read_run
-from uwbslam_jax.tuning.rollout import RolloutError
-from uwbslam_jax.api import run_log
+from uwbslam_jax.settings import Settings
 from uwbslam_jax.sim.simulate import SCENARIOS, Scenario, scenario, settings_overrides, simulate
-from uwbslam_jax.cli.tune_command import TuneOptions, tune
-
-
-class UsageError(ValueError):
-    """A request that cannot be met; the message is one line."""
-
-
-USER_ERRORS = (LogError, ConfigError, RunError, RolloutError, DriverError, UsageError, OSError)
-"""What a user can mend; the command line tells these in one line. Anything else is a defect of ours."""
 
 
 @dataclass
@@ -116,7 +107,7 @@ def call(name: str, words: Sequence[str]) -> None:
     """Runs one command with its own arguments.
 
     Raises:
-      USER_ERRORS: see there. SystemExit: bad usage (status 2), or help was asked for (0); the text is printed.
+      UwbslamError, OSError: what a user can mend. SystemExit: bad usage (status 2), or help was asked for (0); the text is printed.
     """
     options, run = _COMMANDS[name]
     default = None

@@ -18,19 +18,20 @@ from typing import Annotated
 import tyro
 from tyro.conf import arg
 
-from uwbslam_drivers.device import DriverError
-from uwbslam_jax.session import saved_state
-from uwbslam_jax.files import settings_file
-from uwbslam_jax.sim.scenario import settings_overrides
-from uwbslam_jax.settings import Settings
 from uwbslam_jax.cli.finish_run import deliver
-from uwbslam_jax.live.live_run import Devices, LiveRun
-from uwbslam_jax.web.live_page import LivePage
-from uwbslam_jax.web.server import LiveView, parse_address
+from uwbslam_jax.errors import UsageError
 from uwbslam_jax.evaluation import Truth
+from uwbslam_jax.files import settings_file
+from uwbslam_jax.live.devices import Devices
+from uwbslam_jax.live.live_run import LiveRun
 from uwbslam_jax.live.publisher import Publisher
 from uwbslam_jax.live.warm_up import rehearse
+from uwbslam_jax.session import saved_state
+from uwbslam_jax.settings import Settings
+from uwbslam_jax.sim.scenario import settings_overrides
 from uwbslam_jax.sim.simulate import SCENARIOS, scenario
+from uwbslam_jax.web.live_page import LivePage
+from uwbslam_jax.web.server import LiveView, parse_address
 
 _LOOPBACK, _PUBLISH_PORT = "127.0.0.1", 8766
 _EMULATE = """\
@@ -77,7 +78,7 @@ def live(options: LiveOptions) -> None:
     """The command `live`.
 
     Raises:
-      DriverError: a URL, port or option that cannot be met. LogError, RunError, OSError: a file that cannot be used.
+      DriverError, UsageError: a URL, port or option that cannot be met. LogError, RunError, OSError: a file that cannot be used.
     """
     settings = _check(options)
     devices = None if options.lidar is None else Devices(options.lidar, options.uwb)
@@ -105,7 +106,7 @@ def live(options: LiveOptions) -> None:
         print(f"recording to {recording}; Ctrl-C ends", flush=True)
         result = run.run(go)
         if not result.summary["steps"]:
-            raise DriverError(f"nothing was measured: {'; '.join(devices.troubles())}")
+            raise UsageError(f"nothing was measured: {'; '.join(devices.troubles())}")
     truth = options.out / _TRUTH
     known = Truth.load(truth) if options.emulate is not None and truth.exists() else None
     deliver(result, known if len(result.stamps) else None, options.out, f"UWB and LiDAR SLAM: {recording.name}")
@@ -123,16 +124,16 @@ def _told(summary: dict) -> str:
 def _check(options: LiveOptions) -> Settings:
     """The settings, if all options are sound."""
     if options.resume is not None and options.localize is not None:
-        raise DriverError("--resume and --localize: one of them")
+        raise UsageError("--resume and --localize: one of them")
     if options.duration is not None and not options.duration > 0.0:
-        raise DriverError(f"duration {options.duration:g} s: must be greater than 0")
+        raise UsageError(f"duration {options.duration:g} s: must be greater than 0")
     if options.emulate is not None:
         if options.lidar is not None or options.uwb:
-            raise DriverError("--emulate brings its own devices: leave --lidar and --uwb out")
+            raise UsageError("--emulate brings its own devices: leave --lidar and --uwb out")
         if options.emulate not in SCENARIOS:
-            raise DriverError(f"no world {options.emulate}; there are {', '.join(SCENARIOS)}")
+            raise UsageError(f"no world {options.emulate}; there are {', '.join(SCENARIOS)}")
     elif options.lidar is None:
-        raise DriverError("no device: give --lidar URL and --uwb URL, or --emulate workshop to try it without any")
+        raise UsageError("no device: give --lidar URL and --uwb URL, or --emulate workshop to try it without any")
     settings = options.settings
     if options.emulate is not None:  # what a user would configure for this robot
         fits = settings_file.from_dict(settings_overrides(scenario(options.emulate, 0, None)))
@@ -197,7 +198,7 @@ def _emulators(world: str, out: Path) -> Iterator[tuple[str, tuple[str, ...]]]:
                 line = process.stdout.readline() if process.stdout else ""
                 name, _, url = line.strip().partition(" ")
                 if not line:
-                    raise DriverError(f"the emulators do not start: {said}")
+                    raise UsageError(f"the emulators do not start: {said}")
                 said = line.strip()
                 if "://" in url and not name.startswith("uwbslam"):
                     urls[name] = url.strip()

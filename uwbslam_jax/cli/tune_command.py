@@ -15,19 +15,18 @@ import tyro
 from tqdm import tqdm
 from tyro.conf import Positional, arg
 
-from uwbslam_jax.tuning import calibration
-from uwbslam_jax.files import settings_file
-from uwbslam_jax.tuning import parameters
 from uwbslam_jax.cli import tune_pictures
-from uwbslam_jax.tuning import fit
-from uwbslam_jax.tuning.calibration import Calibration
-from uwbslam_jax.settings import ConfigError, Settings
-from uwbslam_jax.tuning.likelihood import Objective, Piece, Score, piece
+from uwbslam_jax.errors import ConfigError, RolloutError
+from uwbslam_jax.evaluation import Truth
+from uwbslam_jax.files import settings_file
 from uwbslam_jax.files.mcap_log import LogReader
 from uwbslam_jax.measurements import Message, TruthMessage
-from uwbslam_jax.evaluation import Truth
-from uwbslam_jax.tuning.rollout import RolloutError, prepare
+from uwbslam_jax.settings import Settings
+from uwbslam_jax.tuning import calibration, fit, parameters
+from uwbslam_jax.tuning.calibration import Calibration
 from uwbslam_jax.tuning.fit import Tuned
+from uwbslam_jax.tuning.likelihood import Objective, Piece, Score, piece
+from uwbslam_jax.tuning.rollout import prepare
 
 _BLOCK = 10
 """Frames whose log-likelihoods are averaged before their spread is taken: neighbours are alike."""

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from uwbslam_jax.tuning.likelihood import Objective
 from uwbslam_jax.tuning.fit import Tuned
+from uwbslam_jax.tuning.likelihood import Objective
 
 _POINTS = 9
 _SIDE = 7

@@ -14,13 +14,12 @@ import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
-from uwbslam_jax.estimator import state_vector
-from uwbslam_jax.estimator import ranging
-from uwbslam_jax.settings import Params
-from uwbslam_jax.numerics.gaussian import Gaussian, inverse3, update_projected
-from uwbslam_jax.numerics.se2 import wrap_angle
+from uwbslam_jax.estimator import ranging, state_vector
 from uwbslam_jax.estimator.matching import Match
 from uwbslam_jax.measurements import Frame
+from uwbslam_jax.numerics.gaussian import Gaussian, inverse3, update_projected
+from uwbslam_jax.numerics.se2 import wrap_angle
+from uwbslam_jax.settings import Params
 
 SURPRISE = 30.0
 """Squared Mahalanobis distance of a match beyond which it is not believed (chi-square, 3: 1e-6)."""

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from uwbslam_jax.numerics import gaussian
 from uwbslam_jax.estimator import state_vector
-from uwbslam_jax.settings import Params
-from uwbslam_jax.numerics.se2 import perpendicular, rotation, safe_norm
 from uwbslam_jax.measurements import Odometry
+from uwbslam_jax.numerics import gaussian
+from uwbslam_jax.numerics.se2 import perpendicular, rotation, safe_norm
+from uwbslam_jax.settings import Params
 
 _COAST_S = 1.5
 """A robot that is not seen keeps its velocity about this long; a longer gap adds no more motion."""

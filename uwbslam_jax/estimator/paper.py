@@ -12,17 +12,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from uwbslam_jax.estimator import matching, ranging, state_vector
+from uwbslam_jax.estimator.lidar_objective import lidar_residual
+from uwbslam_jax.estimator.matching import Match
+from uwbslam_jax.mapping.grid import Grid
+from uwbslam_jax.mapping.sweep import Sweep
+from uwbslam_jax.measurements import Ranges
 from uwbslam_jax.numerics import gaussian
-from uwbslam_jax.estimator import state_vector
-from uwbslam_jax.estimator import matching
-from uwbslam_jax.estimator import ranging
-from uwbslam_jax.settings import Params
 from uwbslam_jax.numerics.gaussian import Gaussian
 from uwbslam_jax.numerics.se2 import gauge_pose, rotation
-from uwbslam_jax.mapping.grid import Grid, Sweep
-from uwbslam_jax.estimator.matching import Match
-from uwbslam_jax.measurements import Ranges
-from uwbslam_jax.estimator.lidar_objective import lidar_residual
+from uwbslam_jax.settings import Params
 
 _HELD = 1e3
 """Weight that keeps the frame's three coordinates and empty slots where they are [1/m]."""

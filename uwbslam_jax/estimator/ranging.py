@@ -9,11 +9,11 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from uwbslam_jax.numerics import gaussian
 from uwbslam_jax.estimator import state_vector
-from uwbslam_jax.settings import Params
-from uwbslam_jax.numerics.se2 import perpendicular
 from uwbslam_jax.measurements import Leaf, Ranges
+from uwbslam_jax.numerics import gaussian
+from uwbslam_jax.numerics.se2 import perpendicular
+from uwbslam_jax.settings import Params
 
 _SOFT = 3.0
 """Normalised innovation at which a range weighs a quarter (Geman-McClure)."""

@@ -12,23 +12,18 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
+from uwbslam_jax.estimator import match_fusion, matching, motion, paper, ranging, state_vector
+from uwbslam_jax.estimator.batched_cond import seldom
+from uwbslam_jax.estimator.matching import Match
+from uwbslam_jax.estimator.state import Estimate, State
 from uwbslam_jax.mapping import grid as occupancy
-from uwbslam_jax.estimator import state_vector
-from uwbslam_jax.estimator import matching
-from uwbslam_jax.estimator import motion
-from uwbslam_jax.estimator import paper
-from uwbslam_jax.estimator import ranging
-from uwbslam_jax.mapping import sweep
-from uwbslam_jax.estimator import match_fusion
-from uwbslam_jax.settings import Config, Params
+from uwbslam_jax.mapping.sweep import find_surface, undo_motion
+from uwbslam_jax.measurements import Frame
 from uwbslam_jax.numerics.gaussian import Gaussian
 from uwbslam_jax.numerics.se2 import rotation, safe_norm, transform_points, wrap_angle
-from uwbslam_jax.mapping.grid import Grid, Sweep
-from uwbslam_jax.estimator.matching import Match
-from uwbslam_jax.measurements import Frame, Scan
-from uwbslam_jax.estimator.batched_cond import seldom
+from uwbslam_jax.settings import Config, Params
 
 _KNOWN_ENOUGH = 0.25
 """Share of returns on observed cells below which a score says nothing: the robot looks at new ground."""
@@ -53,97 +48,6 @@ _DRAW_PULL = (0.003, 0.0003)
 """New ground is drawn at most this far from the match towards the fused pose [m, rad]."""
 
 
-class State(NamedTuple):
-    """All that a step carries to the next; n = 4 K + 5, see `layout`.
-
-    Attributes:
-      belief: over the state vector.
-      active: (K,) slots in use, the robot's always.
-      moving: (K,) nodes taken to be carried about.
-      frame_slots: (2,) the beacons that make the published frame, for preset "paper".
-      scatter: how much each pair's ranges scatter, see ranging.learn_scatter.
-      grid: the map's window.
-      drawn_pose: (3,) where the last scan was drawn.
-      scans_drawn: how many were.
-      map_spread: of the map's errors from place to place, see trust.MapSpread.
-      unrest: variance of the motion between two scans that no velocity explains, see trust.learn_unrest [m^2, rad^2].
-    """
-
-    belief: Gaussian
-    active: Bool[Array, "K"]
-    moving: Bool[Array, "K"]
-    frame_slots: Int[Array, "2"]
-    scatter: ranging.Scatter
-    grid: Grid
-    drawn_pose: Float[Array, "3"]
-    scans_drawn: Int[Array, ""]
-    map_spread: match_fusion.MapSpread
-    unrest: Float[Array, "2"]
-
-
-class Estimate(NamedTuple):
-    """What a step reports, in the frame of the state.
-
-    Attributes:
-      pose, pose_cov: (3,), (3, 3) the robot [m, m, rad].
-      velocity: (2,) [m/s]; yaw_rate [rad/s].
-      beacons, beacon_covs: (K, 2), (K, 2, 2) [m]; slot 0 is the robot.
-      active, moving: (K,).
-      map_error: (3,) of the map where the robot is [m, m, rad].
-      matched_pose: (3,) what the match reported, before the map's own error is taken off.
-      information: (3, 3) what the match told about it [1/m^2 ...]; 0 where it told nothing.
-      score, known: of the match, see Match.
-      poor, searched, drawn: what happened to the scan.
-      innovation, normalised, weight: (M,) of the ranges.
-      log_likelihood: of the ranges; match_log_likelihood: of the match, 0 where there is no scan; None where
-        nobody asks for it.
-    """
-
-    pose: Float[Array, "3"]
-    pose_cov: Float[Array, "3 3"]
-    velocity: Float[Array, "2"]
-    yaw_rate: Float[Array, ""]
-    beacons: Float[Array, "K 2"]
-    beacon_covs: Float[Array, "K 2 2"]
-    active: Bool[Array, "K"]
-    moving: Bool[Array, "K"]
-    map_error: Float[Array, "3"]
-    matched_pose: Float[Array, "3"]
-    information: Float[Array, "3 3"]
-    score: Float[Array, ""]
-    known: Float[Array, ""]
-    poor: Bool[Array, ""]
-    searched: Bool[Array, ""]
-    drawn: Bool[Array, ""]
-    innovation: Float[Array, "M"]
-    normalised: Float[Array, "M"]
-    weight: Float[Array, "M"]
-    log_likelihood: Float[Array, ""]
-    match_log_likelihood: Float[Array, ""] | None
-
-
-def init(config: Config) -> State:
-    """The robot at the origin of its own start frame, no beacon, no map."""
-    n = state_vector.state_size(config.nodes)
-    variance = jnp.ones(n, jnp.float32)
-    pose = jnp.array(state_vector.pose_indices(config.nodes))
-    error = jnp.array(state_vector.map_error_indices(config.nodes))
-    # the frame is the start pose: known exactly, and so is the map drawn from it
-    variance = variance.at[pose].set(1e-8).at[error].set(1e-8)
-    return State(
-        belief=Gaussian(jnp.zeros(n, jnp.float32), jnp.diag(variance)),
-        active=jnp.zeros(config.nodes, bool).at[0].set(True),
-        moving=jnp.zeros(config.nodes, bool),
-        frame_slots=jnp.array([1, 2], jnp.int32),
-        scatter=ranging.quiet(config.nodes),
-        grid=occupancy.empty(config.cells, config.levels, config.resolution),
-        drawn_pose=jnp.zeros(3, jnp.float32),
-        scans_drawn=jnp.zeros((), jnp.int32),
-        map_spread=match_fusion.even_map(),
-        unrest=jnp.array(match_fusion.CALM, jnp.float32) ** 2,
-    )
-
-
 def step(config: Config, params: Params, state: State, frame: Frame) -> tuple[State, Estimate]:
     """One frame through the estimator.
 
@@ -159,7 +63,7 @@ def step(config: Config, params: Params, state: State, frame: Frame) -> tuple[St
         belief = paper.heading_from_velocity(paper.pin_frame(belief, state.frame_slots))
     s = state_vector.unpack(belief.mean)
     sweep = undo_motion(frame.scan, params.lidar, rotation(-s.heading) @ s.velocities[0], s.yaw_rate)
-    surface = sweep.surface(sweep)
+    surface = find_surface(sweep)
     align = _joint_match if config.preset == "paper" else _match_and_fuse
     belief, matched = align(config, params, state, belief, frame, sweep, surface, usable)
     state = state._replace(belief=belief, unrest=matched.unrest, map_spread=matched.map_spread)
@@ -199,7 +103,9 @@ def _match_and_fuse(config, params, state, belief, frame, sweep, surface, usable
     seen = jnp.where(frame.has_scan & _map_errs(config, state), _epoch_seen(config, state.grid, sweep, match.pose), 0.0)
     belief, spread = match_fusion.revisit(belief, state.map_spread, seen, params)
     # before the belief is widened for this very match
-    likelihood = jnp.where(frame.has_scan, match_fusion.log_likelihood(match, belief, params, jnp.sum(sweep.valid)), 0.0)
+    likelihood = jnp.where(
+        frame.has_scan, match_fusion.log_likelihood(match, belief, params, jnp.sum(sweep.valid)), 0.0
+    )
     lost = (match.known > _KNOWN_ENOUGH) & (match.score < _LOST_SCORE)
     lost = lost | (searched & (match.known < _FOUND_KNOWN))
     sure = match_fusion.is_sure(match) & frame.has_scan
@@ -242,26 +148,6 @@ def _joint_match(config, params, state, belief, frame, sweep, surface, usable) -
     likelihood = jnp.where(frame.has_scan, likelihood, 0.0)
     matched = _Matched(match, likelihood, jnp.zeros((3, 3)), no, no, frame.has_scan, state.unrest, state.map_spread)
     return corrected if config.correction else belief, matched
-
-
-def undo_motion(scan: Scan, lidar: Float[Array, "3"], velocity: Float[Array, "2"], yaw_rate: Float[Array, ""]) -> Sweep:
-    """The scan in the robot's frame at its stamp: each beam placed at its own time.
-
-    Args:
-      lidar: pose of the LiDAR on the robot [m, m, rad].
-      velocity: in the robot's own frame [m/s]; yaw_rate [rad/s].
-    """
-    index = jnp.arange(scan.ranges.shape[0], dtype=scan.ranges.dtype)
-    bearing = scan.angle_min + scan.angle_increment * index
-    age = scan.time_increment * index
-    reach = jnp.where(scan.valid, scan.ranges, 0.0)
-    turn = yaw_rate * age
-    c, sn = jnp.cos(bearing + lidar[2]), jnp.sin(bearing + lidar[2])
-    x, y = lidar[0] + reach * c, lidar[1] + reach * sn
-    ct, st = jnp.cos(turn), jnp.sin(turn)
-    points = jnp.stack([ct * x - st * y + velocity[0] * age, st * x + ct * y + velocity[1] * age], axis=-1)
-    step = scan.angle_increment + yaw_rate * scan.time_increment
-    return Sweep(points, scan.valid, lidar, scan.angle_min, step, reach)
 
 
 def _match(config, params, state, belief, sweep, surface, has_scan) -> tuple[Match, Bool[Array, ""]]:

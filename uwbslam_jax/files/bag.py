@@ -12,7 +12,8 @@ from pathlib import Path
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from uwbslam_jax.files.mcap_container import LogError, RawMessage, Recording
+from uwbslam_jax.errors import LogError
+from uwbslam_jax.files.mcap_container import RawMessage, Recording
 
 _MOST_CHANNELS = 1 << 16
 """A channel's number in a file has 16 bits; the next bits tell the file."""

@@ -6,11 +6,11 @@ import math
 from collections import Counter
 from dataclasses import dataclass, field
 
+from uwbslam_jax.errors import LogError
 from uwbslam_jax.files.bag import Bag, Source
 from uwbslam_jax.files.mcap_log import choose_topics
-from uwbslam_jax.files.mcap_container import LogError
-from uwbslam_jax.measurements import Message, RangeMessage, ScanMessage
 from uwbslam_jax.files.schemas import Decoder, Options, Role
+from uwbslam_jax.measurements import Message, RangeMessage, ScanMessage
 
 
 @dataclass(frozen=True, slots=True)

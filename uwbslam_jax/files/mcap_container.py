@@ -27,16 +27,14 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.writer import Writer
 
+from uwbslam_jax.errors import LogError
+
 MAGIC = b"\x89MCAP0\r\n"
 PLAIN_BLOCK_BYTES = 1 << 20  # unchunked messages are read this many bytes at a time
 MAX_CHUNK_BYTES = 1 << 30  # a chunk that claims more is taken as corrupt rather than allocated
 _HEADER = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<BQHIQQ")  # record header, channel, sequence, log time, publish time
 _CHUNK = struct.Struct("<QQQII")  # first and last log time, size, crc, length of the compression's name
-
-
-class LogError(ValueError):
-    """A recording that cannot be used; the message is one line that says what and where."""
 
 
 class _CorruptError(Exception):

@@ -12,12 +12,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 
+from uwbslam_jax.errors import LogError as LogError
 from uwbslam_jax.files.bag import Bag, Source
 from uwbslam_jax.files.mcap_container import Channel, RecordWriter
-from uwbslam_jax.files.mcap_container import LogError as LogError
-from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, ScanMessage, TruthMessage
 from uwbslam_jax.files.ros_types import definition, encode
 from uwbslam_jax.files.schemas import Decoder, Options, Role, make_decoder, plausible
+from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, ScanMessage, TruthMessage
 
 TRUTH_ROBOT = "/ground_truth/robot"
 TRUTH_BEACON = "/ground_truth/beacon/"

@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from uwbslam_jax.files.mcap_container import RecordWriter
-from uwbslam_jax.result import BeaconEstimate, MapImage, Result
 from uwbslam_jax.files.ros_types import build, definition, header, pose, quaternion, serialize, time, vector
+from uwbslam_jax.result import BeaconEstimate, MapImage, Result, crop
 
 DIAGNOSTICS_PERIOD = 100_000_000  # at most 10 Hz [ns]
 PATH_PERIOD = 100_000_000  # at most 10 Hz [ns]: one message, for looking at; /tf has every pose
@@ -72,16 +72,6 @@ def write_result_log(result: Result, path: str | Path) -> None:
             if item.topic not in channels:
                 channels[item.topic] = records.add_topic(item.topic, schema, definition(schema))
             records.write(channels[item.topic], data, item.stamp)
-
-
-def crop(image: MapImage) -> MapImage:
-    """The smallest part of a map that holds every observed cell; a single unknown cell where there is none."""
-    rows, columns = (np.flatnonzero((image.log_odds != 0).any(axis=axis)) for axis in (1, 0))
-    if rows.size == 0:
-        return MapImage(np.zeros((1, 1), np.float32), image.resolution, np.asarray(image.origin, dtype=np.float64))
-    part = image.log_odds[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    origin = np.asarray(image.origin, dtype=np.float64) + image.resolution * np.array([columns[0], rows[0]])
-    return MapImage(part, image.resolution, origin)
 
 
 def _once(result: Result, start: int, known: np.ndarray) -> Iterator[_Item]:

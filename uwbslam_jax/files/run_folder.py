@@ -14,16 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from uwbslam_jax.result import BeaconEstimate, MapImage, Result
-from uwbslam_jax.files.result_log import crop, write_result_log
+from uwbslam_jax.errors import RunError
+from uwbslam_jax.files.result_log import write_result_log
+from uwbslam_jax.result import OCCUPIED_THRESHOLD, BeaconEstimate, MapImage, Result, crop, trinary
 
-OCCUPIED_THRESHOLD = 0.65
 FREE_THRESHOLD = 0.196  # below what 205 reads as, (255 - 205) / 255, so that unknown stays unknown
-_OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205
-
-
-class RunError(ValueError):
-    """A run directory that cannot be read; the message is one line that says what and where."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,15 +81,6 @@ def write_beacons(beacons: list[BeaconEstimate], path: Path) -> None:
         for beacon in sorted(beacons, key=lambda beacon: beacon.id):
             numbers = [*beacon.position, *np.sqrt(np.diagonal(beacon.cov))]
             writer.writerow([beacon.id, *(f"{value:.6f}" for value in numbers), beacon.status])
-
-
-def trinary(log_odds: np.ndarray) -> np.ndarray:
-    """Gray values of map_server: 0 occupied (probability over 0.65), 254 free (seen, more free than not), 205 else.
-
-    A cell counts as free from its first miss on, as in HectorSLAM's published map: few beams cross a far cell twice.
-    """
-    occupied = log_odds > math.log(OCCUPIED_THRESHOLD / (1 - OCCUPIED_THRESHOLD))
-    return np.select([occupied, log_odds < 0], [_OCCUPIED, _FREE], _UNKNOWN).astype(np.uint8)
 
 
 def write_map(image: MapImage, directory: Path) -> None:

@@ -22,9 +22,10 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from uwbslam_jax.files.mcap_container import Channel, LogError
-from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, ScanMessage, TruthMessage
+from uwbslam_jax.errors import LogError
+from uwbslam_jax.files.mcap_container import Channel
 from uwbslam_jax.files.ros_types import STORE, UWB_RANGE
+from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, ScanMessage, TruthMessage
 
 Role = Literal["scan", "uwb", "odom", "truth"]
 Decoder = Callable[[bytes, int], list[Message]]

@@ -11,7 +11,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from uwbslam_jax.settings import ConfigError, Settings
+from uwbslam_jax.errors import ConfigError
+from uwbslam_jax.settings import Settings
 
 _MAX_CELLS = 4096  # side of the finest level of the matching window; beyond this the maps alone take gigabytes
 

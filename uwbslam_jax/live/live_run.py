@@ -11,27 +11,27 @@ import threading
 import time
 from array import array
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from uwbslam_drivers import Source, open_source
 from uwbslam_drivers.clock import host_time
 from uwbslam_jax import process
-from uwbslam_jax.session import saved_state
-from uwbslam_jax.settings import Settings
-from uwbslam_jax.session.result_builder import Facts
+from uwbslam_jax.estimator.compiled import CompileClock
+from uwbslam_jax.estimator.state import Estimate
+from uwbslam_jax.live.devices import Devices
 from uwbslam_jax.live.message_queue import Arrival, Inbox
-from uwbslam_jax.web.live_page import LivePage, Status
-from uwbslam_jax.measurements import ScanMessage, StampedFrame
 from uwbslam_jax.live.publisher import Publisher
 from uwbslam_jax.live.recorder import LogRecorder
+from uwbslam_jax.measurements import ScanMessage, StampedFrame
 from uwbslam_jax.result import Result
-from uwbslam_jax.files.ros_types import recorded
-from uwbslam_jax.api import CompileClock, Runner
+from uwbslam_jax.session import saved_state
+from uwbslam_jax.session.result_builder import Facts
+from uwbslam_jax.session.runner import Runner
 from uwbslam_jax.session.saved_state import Locator, Saved
-from uwbslam_jax.estimator.step import Estimate
+from uwbslam_jax.settings import Settings
+from uwbslam_jax.web.live_page import LivePage, Status
 
 _IDLE_S = 0.05
 _STATUS_S = 0.5
@@ -42,53 +42,6 @@ _SWITCH_S = 0.5e-3
 """A thread that waits for the interpreter gets it after so long: with 5 ms, three threads cost a scan's period."""
 _NO_LOSS = {"measurements", "bytes", "connections"}
 """What devices count that is no measurement lost."""
-
-
-class Devices:
-    """Sources by name, each in a thread of its own.
-
-    Attributes:
-      defect: an error that no device explains; the run ends with it.
-    """
-
-    def __init__(self, lidar: str, uwb: Sequence[str]):
-        """Reads the URLs; nothing is opened yet. Raises DriverError."""
-        names = ["uwb"] if len(uwb) == 1 else [f"uwb {k + 1}" for k in range(len(uwb))]
-        self.sources: dict[str, Source] = {"lidar": open_source(lidar, "lidar")}
-        self.sources |= {name: open_source(url, "uwb") for name, url in zip(names, uwb, strict=True)}
-        self.defect: BaseException | None = None
-        self._threads: list[threading.Thread] = []
-
-    def start(self, inbox: Inbox) -> None:
-        """From now on, measurements go into an inbox."""
-        for name, source in self.sources.items():
-            self._threads.append(threading.Thread(target=self._read, args=(source, inbox), name=name, daemon=True))
-            self._threads[-1].start()
-
-    def _read(self, source: Source, inbox: Inbox) -> None:
-        try:
-            for reading in source:
-                inbox.put(recorded(reading.message), reading.received)
-        except Exception as error:
-            self.defect = error
-
-    def close(self) -> None:
-        for source in self.sources.values():
-            source.close()
-        for thread in self._threads:
-            thread.join()
-
-    def counts(self) -> dict[str, dict[str, int]]:
-        """What each device counted, and where it is."""
-        return {name: dict(sorted(source.counts.items())) for name, source in self.sources.items()}
-
-    def troubles(self) -> list[str]:
-        """Devices that do not deliver, one line each."""
-        return [
-            f"{name} ({source.address.url}) is {source.status}{': ' if source.failure else ''}{source.failure}"
-            for name, source in self.sources.items()
-            if source.status != "streaming"
-        ]
 
 
 class LiveRun:

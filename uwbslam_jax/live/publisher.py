@@ -10,13 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from uwbslam_drivers.device import DriverError
-from uwbslam_jax.files import result_log
-from uwbslam_jax.files import ros_types
+from uwbslam_jax.errors import UsageError
+from uwbslam_jax.estimator.state import Estimate
+from uwbslam_jax.files import result_log, ros_types
 from uwbslam_jax.measurements import StampedFrame
 from uwbslam_jax.result import BeaconEstimate
 from uwbslam_jax.session.session import Session
-from uwbslam_jax.estimator.step import Estimate
 
 BEACONS_S = 1.0
 MAP_S = 5.0
@@ -30,17 +29,17 @@ class Publisher:
     """
 
     def __init__(self, host: str, port: int):
-        """Opens the port; 0 for any that is free. Raises DriverError where it cannot, or the package is not there."""
+        """Opens the port; 0 for any that is free. Raises UsageError where it cannot, or the package is not there."""
         try:
             import foxglove
         except ImportError:
-            raise DriverError("--publish needs foxglove-sdk: pip install 'uwbslam_jax[live]'") from None
+            raise UsageError("--publish needs foxglove-sdk: pip install 'uwbslam_jax[live]'") from None
         self._foxglove: Any = foxglove
         self._context = foxglove.Context()
         try:
             self._server = foxglove.start_server(name="uwbslam", host=host, port=port, context=self._context)
         except (RuntimeError, OSError, ValueError) as error:
-            raise DriverError(f"publishing at {host}:{port}: {error}") from None
+            raise UsageError(f"publishing at {host}:{port}: {error}") from None
         self.url = f"ws://{host}:{self._server.port}"
         self._channels: dict[str, Any] = {}
         self._told_at = self._map_at = 0.0

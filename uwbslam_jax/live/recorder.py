@@ -11,9 +11,9 @@ from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
-from uwbslam_jax.settings import Settings
-from uwbslam_jax.live.message_queue import Arrival
 from uwbslam_jax.files.mcap_log import LogError, LogWriter
+from uwbslam_jax.live.message_queue import Arrival
+from uwbslam_jax.settings import Settings
 
 EVERY_S = 0.25
 """Time between two hand-overs to the operating system; a killed process loses no more than that and what waits."""

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 
-from uwbslam_jax.sim.scenario import INF, Lidar
-from uwbslam_jax.settings import RobotSettings, Settings, UwbSettings
+from uwbslam_jax.estimator.compiled import CompileClock
 from uwbslam_jax.measurements import Message
-from uwbslam_jax.api import CompileClock, Runner
+from uwbslam_jax.session.runner import Runner
+from uwbslam_jax.settings import RobotSettings, Settings, UwbSettings
+from uwbslam_jax.sim.scenario import INF, Lidar
 from uwbslam_jax.sim.simulate import START_NS, scenario, simulate
 
 _RATE = 5.0

@@ -15,6 +15,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from uwbslam_jax.mapping.sweep import Sweep
+
 HIT = float(np.log(0.9 / 0.1))
 FREE = float(np.log(0.4 / 0.6))
 """Log-odds of one observation (HectorSLAM's update factors 0.9 and 0.4)."""
@@ -87,25 +89,6 @@ def lookup(grid: Grid, points: Float[Array, "n 2"], resolution: float, level: in
     corners, at, inside = corner_log_odds(grid.levels[level], grid.origin, size, points)
     value, _ = interpolate(jax.nn.sigmoid(corners), at, size)
     return jnp.where(inside, value, 0.5)
-
-
-class Sweep(NamedTuple):
-    """A scan in the robot's frame at the frame's stamp.
-
-    Attributes:
-      points: (B, 2) end points, each placed at its own time [m].
-      valid: (B,).
-      sensor: (3,) the LiDAR's pose [m, m, rad].
-      bearing0, bearing_step: bearing of beam i in the sensor's frame after the sweep is undone [rad].
-      reach: (B,) length of each beam, 0 where there is no return [m].
-    """
-
-    points: Float[Array, "B 2"]
-    valid: Bool[Array, "B"]
-    sensor: Float[Array, "3"]
-    bearing0: Float[Array, ""]
-    bearing_step: Float[Array, ""]
-    reach: Float[Array, "B"]
 
 
 @cache

@@ -1,4 +1,5 @@
-"""The surfaces that a scan meets: which way they run, and what stands in for beams without a return."""
+"""A scan as points in the robot's frame, and the surfaces that it meets: which way they run, and what stands in for
+beams without a return."""
 
 from __future__ import annotations
 
@@ -8,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from uwbslam_jax.mapping.grid import Sweep
+from uwbslam_jax.measurements import Scan
 
 _NEIGHBOURS = (1, 2, 4, 8, 16)
 _GAPS = (1, 2, 4, 8, 16)
@@ -29,7 +30,7 @@ class Surface(NamedTuple):
     found: Bool[Array, "B"]
 
 
-def surface(sweep: Sweep) -> Surface:
+def find_surface(sweep: Sweep) -> Surface:
     """Surface directions from two neighbours of a beam that are far enough apart for range noise not to matter, one on
     either side, with the next return in place of one that is missing. Where the three are not on one line there is no
     surface.
@@ -85,3 +86,42 @@ def _continued(values, valid, way):
         moved = jnp.append(none, valid[:-stride]) if way > 0 else jnp.append(valid[stride:], none)
         valid = valid | moved
     return values, valid
+
+
+class Sweep(NamedTuple):
+    """A scan in the robot's frame at the frame's stamp.
+
+    Attributes:
+      points: (B, 2) end points, each placed at its own time [m].
+      valid: (B,).
+      sensor: (3,) the LiDAR's pose [m, m, rad].
+      bearing0, bearing_step: bearing of beam i in the sensor's frame after the sweep is undone [rad].
+      reach: (B,) length of each beam, 0 where there is no return [m].
+    """
+
+    points: Float[Array, "B 2"]
+    valid: Bool[Array, "B"]
+    sensor: Float[Array, "3"]
+    bearing0: Float[Array, ""]
+    bearing_step: Float[Array, ""]
+    reach: Float[Array, "B"]
+
+
+def undo_motion(scan: Scan, lidar: Float[Array, "3"], velocity: Float[Array, "2"], yaw_rate: Float[Array, ""]) -> Sweep:
+    """The scan in the robot's frame at its stamp: each beam placed at its own time.
+
+    Args:
+      lidar: pose of the LiDAR on the robot [m, m, rad].
+      velocity: in the robot's own frame [m/s]; yaw_rate [rad/s].
+    """
+    index = jnp.arange(scan.ranges.shape[0], dtype=scan.ranges.dtype)
+    bearing = scan.angle_min + scan.angle_increment * index
+    age = scan.time_increment * index
+    reach = jnp.where(scan.valid, scan.ranges, 0.0)
+    turn = yaw_rate * age
+    c, sn = jnp.cos(bearing + lidar[2]), jnp.sin(bearing + lidar[2])
+    x, y = lidar[0] + reach * c, lidar[1] + reach * sn
+    ct, st = jnp.cos(turn), jnp.sin(turn)
+    points = jnp.stack([ct * x - st * y + velocity[0] * age, st * x + ct * y + velocity[1] * age], axis=-1)
+    step = scan.angle_increment + yaw_rate * scan.time_increment
+    return Sweep(points, scan.valid, lidar, scan.angle_min, step, reach)

@@ -6,14 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-_SOFT = 4.0
-"""Whitened residual at which a range's influence starts to fall (Geman-McClure)."""
-RANGE_FLOOR_M = 0.02
-"""However many ranges are averaged, their mean is not better than this."""
-DECIDED = 15.0
-"""Difference of log-likelihood that decides between two explanations."""
-SIGMA_ENOUGH_M = 0.15
-"""A beacon enters when its position is known this well among the others."""
+from uwbslam_jax.numerics.robust import _SOFT, DECIDED, RANGE_FLOOR_M, SIGMA_ENOUGH_M, soften
+
 WALK_M_S = 1.0
 """Standard deviation of each component of the velocity of somebody who carries a beacon."""
 _APART_M = 0.5
@@ -154,12 +148,6 @@ def _unit(place: np.ndarray, anchors: np.ndarray) -> np.ndarray:
     return u / np.maximum(np.linalg.norm(u, axis=1), 1e-6)[:, None]
 
 
-def misfit(spot: np.ndarray, anchors: np.ndarray, distance: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """(R,) negative log-likelihood (Geman-McClure) of each range, from places (2,) or (R, 2) [m]."""
-    r, _ = soften((np.linalg.norm(spot - anchors, axis=1) - distance) / sigma)
-    return 0.5 * r**2
-
-
 def locate(anchors: np.ndarray, distance: np.ndarray, sigma: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     """Place (2,) and covariance (2, 2) of a node at rest from ranges to known points, None where they do not
     determine it.
@@ -209,9 +197,3 @@ def _spot(state, cost: float, time, anchors, distance, sigma, walk: float) -> Sp
     # a residual depends on its anchor as on the place, with the other sign
     pull = (J @ cov)[:, :, None] * J[:, None, :2]
     return Spot(state[:2], state[2:], cov, cost, pull)
-
-
-def soften(whitened: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Residual whose half square is the Geman-McClure loss, and its derivative."""
-    inside = 1.0 + (whitened / _SOFT) ** 2
-    return whitened / np.sqrt(inside), inside**-1.5

@@ -13,8 +13,19 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
+from uwbslam_jax.measurements import (
+    Frame,
+    Message,
+    Odometry,
+    OdometryMessage,
+    RangeMessage,
+    Ranges,
+    Scan,
+    ScanMessage,
+    StampedFrame,
+    TruthMessage,
+)
 from uwbslam_jax.settings import Settings
-from uwbslam_jax.measurements import Frame, Message, Odometry, OdometryMessage, RangeMessage, Ranges, Scan, ScanMessage, StampedFrame, TruthMessage
 
 _SCANLESS_S = 1.0
 """Ranges wait this long for a scan before they make a frame of their own."""

@@ -9,11 +9,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from uwbslam_jax.numerics.row_buffer import Column
-from uwbslam_jax.backend.graph import map_pose, sight
+from uwbslam_jax.estimator.state import Estimate, map_pose, sight
 from uwbslam_jax.measurements import StampedFrame
-from uwbslam_jax.estimator.step import Estimate
-from uwbslam_jax.startup.decide import Adopted, carried_along
+from uwbslam_jax.numerics.row_buffer import Column
+from uwbslam_jax.numerics.se2_host import carried_along
+from uwbslam_jax.startup.adopt import Adopted
 
 _RESIDUALS_EVERY_S = 1.0
 """Of each pair one is kept this often: frames at fixed times would see the same pairs again and again, or none."""
@@ -141,6 +141,10 @@ class History:
         self._seen = estimate
         if frame.frame.has_scan:
             self.last_scan = (number, frame, estimate)
+
+    def passage(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Stamps (T,) [ns], map poses (T, 3) in float64 and sight (T,) of all frames."""
+        return np.array(self.stamps), np.array(self.map_poses, float), np.array(self.sight)
 
     def event(self, stamp: int, text: str) -> None:
         """Something worth telling happened."""

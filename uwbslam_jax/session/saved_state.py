@@ -18,15 +18,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from uwbslam_jax.beacons import state_edits
-from uwbslam_jax.estimator import step
-from uwbslam_jax.settings import Settings, make_config, make_params
-from uwbslam_jax.numerics.gaussian import Gaussian
-from uwbslam_jax.measurements import RangeMessage
-from uwbslam_jax.numerics.multilateration import locate
-from uwbslam_jax.files.run_folder import RunError
-from uwbslam_jax.session.session import Session
-from uwbslam_jax.estimator.step import State
+from uwbslam_jax.errors import RunError
+from uwbslam_jax.estimator.state import State, init
 from uwbslam_jax.mapping.tiled_map import Tiles
+from uwbslam_jax.measurements import RangeMessage
+from uwbslam_jax.numerics.gaussian import Gaussian
+from uwbslam_jax.numerics.multilateration import locate
+from uwbslam_jax.session.session import Session
+from uwbslam_jax.settings import Settings, make_config, make_params
 
 FILE = "state.npz"
 _VERSION = 1
@@ -91,7 +90,7 @@ def load(directory: Path, settings: Settings) -> Saved:
             raise RunError(f"{path}: saved with map.resolution {about['resolution']:g}")
         tiles = Tiles(settings.map.resolution)
         tiles.load(arrays["tiles"], [arrays[f"layer{k}"] for k in range(sum(n.startswith("layer") for n in arrays))])
-        like = jax.eval_shape(lambda: step.init(make_config(settings)))
+        like = jax.eval_shape(lambda: init(make_config(settings)))
         for name, leaf in _leaves(like):
             if arrays[f"state{name}"].shape != leaf.shape:
                 raise RunError(f"{path}: saved with other map.size_m, map.levels or uwb.max_beacons")

@@ -15,24 +15,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from uwbslam_jax.estimator import compiled
-from uwbslam_jax.estimator import state_vector
-from uwbslam_jax.estimator import step
-from uwbslam_jax.startup import decide
-from uwbslam_jax.beacons.keeper import BeaconKeeper
-from uwbslam_jax.settings import Params, Settings, make_config, make_params
-from uwbslam_jax.backend.graph import Graph
 from uwbslam_jax.backend.final_solution import Hindsight, Question, look_back
-from uwbslam_jax.session.history import History
-from uwbslam_jax.startup.keyframe_buffer import Buffer
-from uwbslam_jax.measurements import StampedFrame
+from uwbslam_jax.backend.graph import Graph
 from uwbslam_jax.backend.range_means import Node, RangeMeans
-from uwbslam_jax.mapping.redraw import redraw
 from uwbslam_jax.backend.revision import Reviser, Revision, is_news, take_over
-from uwbslam_jax.beacons.evidence import MEMORY_S
-from uwbslam_jax.estimator.step import Estimate, State
 from uwbslam_jax.backend.smoothing import Solution
-from uwbslam_jax.mapping.tiled_map import Tiles
+from uwbslam_jax.beacons.evidence import MEMORY_S
+from uwbslam_jax.beacons.keeper import BeaconKeeper
+from uwbslam_jax.estimator import compiled, state_vector
+from uwbslam_jax.estimator.state import Estimate, State, init
+from uwbslam_jax.mapping.tiled_map import Tiles, redraw
+from uwbslam_jax.measurements import StampedFrame
+from uwbslam_jax.session.history import History
+from uwbslam_jax.settings import Params, Settings, make_config, make_params
+from uwbslam_jax.startup import decide
+from uwbslam_jax.startup.adopt import adopt
+from uwbslam_jax.startup.keyframe_buffer import Buffer
 
 CONTROL_EVERY = compiled.GROUP
 """Frames between two looks of the host."""
@@ -63,7 +61,7 @@ class Session:
         # until the beacons are placed there is nothing for the paper's steps to stand on
         self.config = dataclasses.replace(make_config(settings), preset="robust")
         self.params = make_params(settings)
-        self.state = step.init(self.config)
+        self.state = init(self.config)
         self.tiles = Tiles(settings.map.resolution)
         self.history = History()
         self.decided_at: int | None = None
@@ -144,7 +142,7 @@ class Session:
             self._look()
         self._reviser.close()
         question = self._question()
-        self.hindsight = None if question is None else look_back(question, self.history)
+        self.hindsight = None if question is None else look_back(question, *self.history.passage())
         if self.hindsight is None:
             return
         self._learn_biases(self.hindsight.solution, int(self.history.stamps[-1]))
@@ -226,7 +224,7 @@ class Session:
             nodes = [0, *outcome.placement.slots]
             self.found_bias = dict(zip(nodes, map(float, outcome.placement.bias), strict=True))
             self.params = self._biased(make_params(self.settings, self._slots))
-        adopted = decide.adopt(
+        adopted = adopt(
             self.config, self.params, self.state, self.tiles, self._buffer, outcome.placement, (origin, along)
         )
         self.state, self.decided_at = adopted.state, now

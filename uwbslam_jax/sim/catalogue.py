@@ -11,10 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from uwbslam_jax.sim import rays
-from uwbslam_jax.sim import worlds
-from uwbslam_jax.sim.scenario import INF, Beacon, Follow, Lidar, Scenario, Uwb, Walk, Wheels, stream
+from uwbslam_jax.sim import rays, worlds
 from uwbslam_jax.sim.paths import Along, Carried, Path, Piece, Rest, Track, Turn
+from uwbslam_jax.sim.scenario import INF, Beacon, Follow, Lidar, Scenario, Uwb, Walk, Wheels, stream
 from uwbslam_jax.sim.worlds import World
 
 

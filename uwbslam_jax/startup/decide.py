@@ -7,24 +7,19 @@ While the step runs on LiDAR (and odometry) alone, a `Buffer` keeps keyframes an
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
-import jax.numpy as jnp
 import numpy as np
 
-from uwbslam_jax.estimator import state_vector
-from uwbslam_jax.settings import Config, Params
-from uwbslam_jax.numerics.gaussian import Gaussian
+from uwbslam_jax.estimator.published_frame import published
+from uwbslam_jax.measurements import Ranges
+from uwbslam_jax.numerics.robust import CALIBRATED_M, DECIDED, SIGMA_ENOUGH_M, largest_sigma
+from uwbslam_jax.numerics.se2_host import numeric_jacobian
+from uwbslam_jax.startup.adopt import _last_and_beacons
 from uwbslam_jax.startup.hypotheses import explanations
 from uwbslam_jax.startup.keyframe_buffer import Buffer
-from uwbslam_jax.measurements import Ranges
-from uwbslam_jax.numerics.multilateration import DECIDED, SIGMA_ENOUGH_M
-from uwbslam_jax.startup.placement import CALIBRATED_M, Placement, Problem, largest_sigma, rotation
-from uwbslam_jax.mapping.redraw import redraw
-from uwbslam_jax.estimator.step import State
-from uwbslam_jax.mapping.tiled_map import Tiles
+from uwbslam_jax.startup.placement import Placement, Problem
 
 _MOVED_ENOUGH_M = 1.0
 _BIAS_M = 0.3
@@ -123,168 +118,3 @@ def choose_frame(placement: Placement, ids: dict[int, int]) -> tuple[int, int]:
     origin = min(placement.slots, key=lambda slot: ids[slot])
     away = np.linalg.norm(placement.beacons - placement.beacons[placement.slots.index(origin)], axis=1)
     return origin, placement.slots[int(np.argmax(away))]
-
-
-def _last_and_beacons(placement: Placement) -> tuple[np.ndarray, np.ndarray]:
-    """Last keyframe's pose and the beacons as one vector, with their covariance."""
-    last = placement.poses.size - 3
-    return np.concatenate([placement.poses[-1], placement.beacons.ravel()]), placement.cov[last:, last:]
-
-
-@dataclass(frozen=True)
-class Adopted:
-    """A start-up that was decided.
-
-    Attributes:
-      state: the estimator's state in the published frame.
-      anchors: (N,) stamps of the keyframes [ns]; before, after: (N, 3) their poses in the start frame and in the
-        published one. A pose of the start moves with the keyframes before and after it.
-    """
-
-    state: State
-    anchors: np.ndarray
-    before: np.ndarray
-    after: np.ndarray
-
-    def republish(self, stamps: np.ndarray, poses: np.ndarray) -> np.ndarray:
-        """Poses (T, 3) of the start frame, taken at stamps (T,) [ns], in the published frame."""
-        return carried_along(stamps, poses, self.anchors, self.before, self.after)
-
-    @property
-    def turn(self) -> float:
-        """Of the published frame against the start frame [rad]."""
-        return float(self.after[-1, 2] - self.before[-1, 2])
-
-
-def carried_along(
-    stamps: np.ndarray, poses: np.ndarray, anchors: np.ndarray, before: np.ndarray, after: np.ndarray
-) -> np.ndarray:
-    """Poses (T, 3) taken at stamps (T,) [ns] of a track whose keyframes, at anchors (N,) [ns], have moved from before
-    (N, 3) to after (N, 3): each with the keyframes before and after it."""
-    last = len(anchors) - 1
-    at = np.clip(np.searchsorted(anchors, stamps, side="right") - 1, 0, last)
-    next_one = np.minimum(at + 1, last)
-    span = np.maximum(anchors[next_one] - anchors[at], 1)
-    share = np.clip((stamps - anchors[at]) / span, 0.0, 1.0)[:, None]
-    ends = [compose(after[k], between(before[k], poses)) for k in (at, next_one)]
-    return (1 - share) * ends[0] + share * ends[1]
-
-
-def adopt(
-    config: Config,
-    params: Params,
-    state: State,
-    tiles: Tiles,
-    buffer: Buffer,
-    placement: Placement,
-    frame_slots: tuple[int, int],
-) -> Adopted:
-    """The state in the paper's frame (one beacon at the origin, another on +x), its covariance carried along.
-
-    Args:
-      state: of the LiDAR-only run in the start frame; tiles: what of its map lies outside the window.
-      frame_slots: slots of the two beacons that make the frame.
-    """
-    keys = buffer.track()
-    before = np.array([key.pose for key in keys])
-    pose = np.asarray(state_vector.robot_pose(state.belief.mean), float)
-    onward = between(before[-1], pose)
-    x, cov = _last_and_beacons(placement)
-    y = partial(published, slots=placement.slots, frame_slots=frame_slots, onward=onward)
-    J = numeric_jacobian(y, x)
-    cov = J @ cov @ J.T
-    motion = frame_motion(placement.beacons, placement.slots, frame_slots)
-    after = compose(motion, placement.poses)
-    belief = anchored(state.belief, config.nodes, y(x), cov, placement.slots, pose)
-    active = jnp.zeros(config.nodes, bool).at[jnp.array([0, *placement.slots])].set(True)
-    seen = [(pose, key.snapshot()) for pose, key in zip(after, keys, strict=True) if bool(key.frame.frame.has_scan)]
-    grid = redraw(config, params, tiles, seen, y(x)[:2])
-    adopted = state._replace(
-        belief=belief,
-        active=active,
-        frame_slots=jnp.array(frame_slots, jnp.int32),
-        scatter=state.scatter._replace(log=jnp.asarray(buffer.scatter(config.nodes), jnp.float32)),
-        grid=grid,
-        map_spread=state.map_spread._replace(epoch=jnp.ones(())),
-        drawn_pose=jnp.asarray(y(x)[:3], jnp.float32),
-    )
-    return Adopted(adopted, np.array([key.frame.stamp for key in keys]), before, after)
-
-
-def frame_motion(beacons: np.ndarray, slots: Sequence[Hashable], frame_slots: Sequence[Hashable]) -> np.ndarray:
-    """(3,) the rigid motion that puts one of the beacons (B, 2) at the origin and another on +x."""
-    origin, along = (beacons[slots.index(s)] for s in frame_slots)
-    theta = -np.arctan2(along[1] - origin[1], along[0] - origin[0])
-    return np.append(-rotation(theta) @ origin, theta)
-
-
-def published(x: np.ndarray, *, slots, frame_slots, onward) -> np.ndarray:
-    """Robot pose now and beacons in the published frame, from the last keyframe and beacons in the start frame."""
-    beacons = x[3:].reshape(-1, 2)
-    motion = frame_motion(beacons, slots, frame_slots)
-    robot = compose(motion, compose(x[:3], onward))
-    return np.concatenate([robot, (beacons @ rotation(motion[2]).T + motion[:2]).ravel()])
-
-
-def numeric_jacobian(function, x: np.ndarray) -> np.ndarray:
-    h = 1e-6
-    columns = [(function(x + h * e) - function(x - h * e)) / (2 * h) for e in np.eye(len(x))]
-    return np.stack(columns, axis=1)
-
-
-def anchored(
-    belief: Gaussian,
-    nodes: int,
-    values: np.ndarray,
-    cov: np.ndarray,
-    slots: list[int],
-    old_pose: np.ndarray,
-    apart: Sequence[int] = (),
-) -> Gaussian:
-    """State vector and covariance from robot pose and beacons (3 + 2 B,); velocities turn with the frame.
-
-    The map is drawn at the estimated poses, so its error is that of the pose with the other sign: a match then
-    reports what the track already says, and only the ranges can tell the two apart.
-
-    Args:
-      slots: of the beacons; old_pose: (3,) of the robot in the belief. apart: slots that are to stay as they are.
-    """
-    mean, P = np.array(belief.mean, float), np.array(belief.cov, float)
-    pose, error = np.array(state_vector.pose_indices(nodes)), np.array(state_vector.map_error_indices(nodes))
-    velocity, beacon_velocities = np.arange(2 * nodes, 2 * nodes + 2), np.arange(2 * nodes + 2, 4 * nodes)
-    placed = np.concatenate([[2 * s, 2 * s + 1] for s in slots])
-    R = rotation(values[2] - old_pose[2])
-    mean[velocity] = R @ mean[velocity]
-    moving = np.append(velocity, 4 * nodes + 1)
-    motion_cov = P[np.ix_(moving, moving)]
-    motion_cov[:2] = R @ motion_cov[:2]
-    motion_cov[:, :2] = motion_cov[:, :2] @ R.T
-    own = P
-    P = np.eye(len(mean))
-    P[beacon_velocities, beacon_velocities] = 1e-8
-    P[np.ix_(moving, moving)] = motion_cov
-    for slot in apart:  # what is not among the beacons keeps what is known of it by itself
-        rows = np.array([2 * slot, 2 * slot + 1, 2 * (nodes + slot), 2 * (nodes + slot) + 1])
-        P[np.ix_(rows, rows)] = own[np.ix_(rows, rows)]
-    known = np.concatenate([pose, placed])
-    P[np.ix_(known, known)] = cov
-    P[np.ix_(error, known)] = -cov[:3]
-    P[np.ix_(known, error)] = -cov[:, :3]
-    P[np.ix_(error, error)] = cov[:3, :3]
-    mean[pose], mean[placed], mean[error] = values[:3], values[3:], 0.0
-    return Gaussian(jnp.asarray(mean, jnp.float32), jnp.asarray(P, jnp.float32))
-
-
-def compose(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Host version of geometry.compose for (..., 3) poses in float64; headings are not wrapped."""
-    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
-    x = a[..., 0] + c * b[..., 0] - s * b[..., 1]
-    y = a[..., 1] + s * b[..., 0] + c * b[..., 1]
-    return np.stack([x, y, a[..., 2] + b[..., 2]], axis=-1)
-
-
-def between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Host version of geometry.between for (..., 3) poses in float64; headings are not wrapped."""
-    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
-    dx, dy = b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]
-    return np.stack([c * dx + s * dy, -s * dx + c * dy, b[..., 2] - a[..., 2]], axis=-1)

@@ -12,9 +12,10 @@ from itertools import pairwise, product
 
 import numpy as np
 
-from uwbslam_jax.startup.keyframe_buffer import turned
-from uwbslam_jax.numerics.multilateration import multilaterate, soften
-from uwbslam_jax.startup.placement import Placement, Problem, rotation
+from uwbslam_jax.numerics.multilateration import multilaterate
+from uwbslam_jax.numerics.robust import soften
+from uwbslam_jax.numerics.se2_host import rotation, turned
+from uwbslam_jax.startup.placement import Placement, Problem
 
 _ANGLES = 72
 _WAYS = 2

@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from uwbslam_jax.measurements import Ranges, Snapshot, StampedFrame
-from uwbslam_jax.numerics.multilateration import RANGE_FLOOR_M
+from uwbslam_jax.numerics.robust import mean_sigma
+from uwbslam_jax.numerics.se2_host import turned
 
 _MOVED = (0.25, 0.2)
 """A keyframe every so much of path or turn [m, rad]."""
@@ -29,8 +30,6 @@ _WINDOW = 21
 """So many ranges of a pair around one tell how much they scatter there."""
 _WILD_M = 0.5
 """A range this far from the median of its interval takes no part in the mean."""
-_QUIET = 1.6
-"""Scatter beyond this multiple of sigma_n is no chance but a range through walls or a radio that locks early."""
 
 
 @dataclass(frozen=True)
@@ -255,16 +254,3 @@ class Buffer:
             # a median of n is as good as a mean of 0.64 n
             found[pair] = middle, mean_sigma(0.64 * len(values), scatter, self.sigma_n)
         return found
-
-
-def mean_sigma(count: float, scatter: float, sigma_n: float) -> float:
-    """Standard deviation of a mean of `count` ranges; where they scatter more than the radio does, what makes them
-    scatter does not average out."""
-    excess = max(scatter**2 - (_QUIET * sigma_n) ** 2, 0.0)
-    return float(np.sqrt(sigma_n**2 / max(count, 1.0) + RANGE_FLOOR_M**2 + excess))
-
-
-def turned(theta: np.ndarray | float, xy: np.ndarray) -> np.ndarray:
-    """Vectors (..., 2) turned by angles (...) [rad]."""
-    c, s = np.cos(theta), np.sin(theta)
-    return np.stack([c * xy[..., 0] - s * xy[..., 1], s * xy[..., 0] + c * xy[..., 1]], axis=-1)

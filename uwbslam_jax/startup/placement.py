@@ -10,8 +10,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from uwbslam_jax.startup.keyframe_buffer import Buffer, Keyframe, turned
-from uwbslam_jax.numerics.multilateration import DECIDED, multilaterate, soften
+from uwbslam_jax.numerics.multilateration import multilaterate
+from uwbslam_jax.numerics.robust import CALIBRATED_M, DECIDED, largest_sigma, soften
+from uwbslam_jax.numerics.se2_host import rotation, turned
+from uwbslam_jax.startup.keyframe_buffer import Buffer, Keyframe
 
 _MOST_MOVES = 20
 _COARSE = (8.0, 1.0)
@@ -19,8 +21,6 @@ _COARSE = (8.0, 1.0)
 the radio errs all its ranges were outliers, and a beacon could as well be anywhere."""
 _ENOUGH = 0.02
 """The batch problem is solved when a move gains less log-likelihood than this."""
-CALIBRATED_M = 1e-3
-"""Standard deviation of a node's bias when ranges are taken to be calibrated [m]."""
 
 
 @dataclass(frozen=True)
@@ -59,12 +59,6 @@ class Placement:
     def apart(self, other: Placement) -> np.ndarray:
         """(B,) how far the beacons of another explanation are from these [m]."""
         return np.linalg.norm(self.beacons - other.beacons, axis=1)
-
-
-def largest_sigma(cov: np.ndarray) -> np.ndarray:
-    """(B,) largest standard deviation of each of B points with joint covariance (2 B, 2 B)."""
-    blocks = [cov[2 * b : 2 * b + 2, 2 * b : 2 * b + 2] for b in range(len(cov) // 2)]
-    return np.array([np.sqrt(max(np.linalg.eigvalsh(block)[-1], 0.0)) for block in blocks])
 
 
 @dataclass(frozen=True)
@@ -303,9 +297,3 @@ def _steps(keys: list[Keyframe]) -> tuple[np.ndarray, np.ndarray]:
         cov = np.linalg.inv(turn @ b.information @ turn.T + np.linalg.inv(loose)) + tight
         roots[k] = np.linalg.cholesky(np.linalg.inv(cov)).T
     return steps, roots
-
-
-def rotation(theta: float) -> np.ndarray:
-    """(2, 2) rotation by an angle [rad]."""
-    c, s = np.cos(theta), np.sin(theta)
-    return np.array([[c, -s], [s, c]])

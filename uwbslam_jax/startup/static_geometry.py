@@ -16,9 +16,9 @@ from jaxtyping import Float, Int
 from scipy.optimize import least_squares
 from scipy.sparse.csgraph import shortest_path
 
-from uwbslam_jax.settings import Params
 from uwbslam_jax.measurements import StampedFrame
-from uwbslam_jax.numerics.multilateration import RANGE_FLOOR_M
+from uwbslam_jax.numerics.robust import RANGE_FLOOR_M
+from uwbslam_jax.settings import Params
 
 _KEPT = 1024
 """So many of a link's newest ranges are kept."""

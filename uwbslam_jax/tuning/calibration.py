@@ -12,16 +12,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwbslam_jax.tuning import parameters
-from uwbslam_jax.settings import Params, Settings
-from uwbslam_jax.session.frame_assembler import FrameAssembler
 from uwbslam_jax.backend.graph import Graph
-from uwbslam_jax.measurements import Message
-from uwbslam_jax.tuning.mounting import FIXED, Mounting
-from uwbslam_jax.tuning.rollout import RolloutError
-from uwbslam_jax.api import fit_beams
-from uwbslam_jax.session.session import Session
 from uwbslam_jax.backend.smoothing import Solution
+from uwbslam_jax.errors import RolloutError
+from uwbslam_jax.measurements import Message
+from uwbslam_jax.session.frame_assembler import FrameAssembler
+from uwbslam_jax.session.runner import fit_beams
+from uwbslam_jax.session.session import Session
+from uwbslam_jax.settings import Params, Settings
+from uwbslam_jax.tuning import parameters
+from uwbslam_jax.tuning.mounting import FIXED, Mounting
 
 _OBSERVED = 1 / 3
 """What is known no better than this share of its prior spread is not observed."""

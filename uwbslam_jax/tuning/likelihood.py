@@ -15,12 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from uwbslam_jax.tuning import parameters
-from uwbslam_jax.settings import Config, Params
-from uwbslam_jax.measurements import Frame
+from uwbslam_jax.estimator.state import State
 from uwbslam_jax.evaluation import Truth
+from uwbslam_jax.measurements import Frame
+from uwbslam_jax.settings import Config, Params
+from uwbslam_jax.tuning import parameters
 from uwbslam_jax.tuning.rollout import Losses, Rollout, checkpointed, losses, rescaled, whole_chunks
-from uwbslam_jax.estimator.step import State
 
 Goal = Literal["likelihood", "truth"]
 HELD_SHARE = 0.25

@@ -7,13 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwbslam_jax.settings import Params
-from uwbslam_jax.backend.graph import Graph, relative, wrapped
-from uwbslam_jax.startup.keyframe_buffer import turned
-from uwbslam_jax.numerics.multilateration import soften
+from uwbslam_jax.backend.graph import Graph
 from uwbslam_jax.backend.smoothing import Problem, Solution
+from uwbslam_jax.numerics.robust import soften
+from uwbslam_jax.numerics.se2_host import compose, relative, turned, wrapped
 from uwbslam_jax.numerics.sparse_least_squares import Sink, covariance, minimise
-from uwbslam_jax.startup.decide import compose
+from uwbslam_jax.settings import Params
 
 _SCALE = 0.1
 """Spread of the wheels' scale errors, of way and turn."""

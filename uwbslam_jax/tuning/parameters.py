@@ -13,7 +13,8 @@ from collections.abc import Mapping, Sequence
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from uwbslam_jax.settings import ConfigError, Params, Settings
+from uwbslam_jax.errors import ConfigError
+from uwbslam_jax.settings import Params, Settings
 
 NOISES: dict[str, tuple[str, str, str]] = {
     "gamma": ("filter", "gamma", "1/m^2"),

@@ -19,15 +19,16 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from uwbslam_jax.estimator import step
-from uwbslam_jax.settings import Config, Params, Settings
-from uwbslam_jax.session.frame_assembler import FrameAssembler
+from uwbslam_jax.errors import RolloutError
+from uwbslam_jax.estimator.state import State
+from uwbslam_jax.estimator.step import step
 from uwbslam_jax.mapping.grid import EPOCH_LEVEL, Grid
-from uwbslam_jax.measurements import Frame, Message, RangeMessage, StampedFrame
-from uwbslam_jax.api import fit_beams
-from uwbslam_jax.session.session import CONTROL_EVERY, Session
-from uwbslam_jax.estimator.step import State
 from uwbslam_jax.mapping.tiled_map import TILE
+from uwbslam_jax.measurements import Frame, Message, RangeMessage, StampedFrame
+from uwbslam_jax.session.frame_assembler import FrameAssembler
+from uwbslam_jax.session.runner import fit_beams
+from uwbslam_jax.session.session import CONTROL_EVERY, Session
+from uwbslam_jax.settings import Config, Params, Settings
 
 _SETTLED = 30
 """Frames after start-up has decided that beacons have to be placed which it was not yet sure of."""
@@ -38,10 +39,6 @@ _BORDER_M = 0.5
 _EVERY_BEAM = 20
 FEWEST_FRAMES = 60
 """A shorter rollout tells nothing."""
-
-
-class RolloutError(ValueError):
-    """A recording that has no rollout; the message is one line."""
 
 
 class Losses(NamedTuple):
@@ -191,7 +188,7 @@ def rescaled(params: Params, before: Params, state: State) -> State:
 def _step(config: Config, params: Params, state: State, frame: Frame) -> tuple[State, Losses]:
     # cells are drawn by whole numbers and do not depend on any parameter but by jumps: there is no derivative to carry
     levels = tuple(lax.stop_gradient(level) for level in state.grid.levels)
-    state, told = step.step(config, params, state._replace(grid=state.grid._replace(levels=levels)), frame)
+    state, told = step(config, params, state._replace(grid=state.grid._replace(levels=levels)), frame)
     used = jnp.sum(told.weight > 0).astype(jnp.float32)
     assert told.match_log_likelihood is not None  # only the host goes without
     return state, Losses(-told.log_likelihood, -told.match_log_likelihood, used, told.pose)

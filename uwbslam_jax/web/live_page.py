@@ -16,14 +16,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from uwbslam_jax.web import page
+from uwbslam_jax.estimator.state import Estimate
 from uwbslam_jax.mapping.grid import Grid
+from uwbslam_jax.mapping.tiled_map import Tiles
 from uwbslam_jax.measurements import StampedFrame
-from uwbslam_jax.web.page_data import extent, numbers, picture
 from uwbslam_jax.result import BeaconEstimate
 from uwbslam_jax.session.session import Session
-from uwbslam_jax.estimator.step import Estimate
-from uwbslam_jax.mapping.tiled_map import Tiles
+from uwbslam_jax.web import page
+from uwbslam_jax.web.page_data import extent, numbers, picture
 
 STEP_S = 0.1
 """Time between two steps that are shown."""

@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from uwbslam_jax.result import BeaconEstimate, MapImage, Result
-from uwbslam_jax.files.result_log import crop
+from uwbslam_jax.result import BeaconEstimate, MapImage, Result, crop
 
 # Embedded at most: what a screen can show and a file of a few megabytes holds.
 _POSES, _SAMPLES, _RESIDUALS, _PIXELS = 6000, 2000, 12_000, 2000

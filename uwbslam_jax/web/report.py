@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from uwbslam_jax.result import Result
 from uwbslam_jax.web import page
 from uwbslam_jax.web.page_data import diagnostics, page_data, pair_kinds, pair_residuals, span
-from uwbslam_jax.result import Result
 
 _PAIRS = 60  # rows of the table of pairs
 

@@ -11,7 +11,7 @@ import threading
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
-from uwbslam_drivers.device import DriverError
+from uwbslam_jax.errors import UsageError
 from uwbslam_jax.web.live_page import STEP_S, WORDS_S, Event, LivePage
 
 _MOST_VIEWERS = 16
@@ -22,10 +22,10 @@ _OWN_NAMES = ("127.0.0.1", "localhost")
 
 
 def parse_address(text: str) -> tuple[str, int]:
-    """Host and port of HOST:PORT. Raises DriverError with one line."""
+    """Host and port of HOST:PORT. Raises UsageError with one line."""
     host, colon, port = text.rpartition(":")
     if not (colon and host and port.isdecimal() and int(port) < 1 << 16):
-        raise DriverError(f"{text}: must be HOST:PORT")
+        raise UsageError(f"{text}: must be HOST:PORT")
     return host.strip("[]"), int(port)
 
 
@@ -37,7 +37,7 @@ class LiveView:
     """
 
     def __init__(self, live: LivePage, host: str, port: int):
-        """Opens the port; 0 for any that is free. Raises DriverError where it cannot be opened."""
+        """Opens the port; 0 for any that is free. Raises UsageError where it cannot be opened."""
         self._page = live
         self._loopback = host in _OWN_NAMES
         self._viewers: set[queue.Queue[Event]] = set()
@@ -63,7 +63,7 @@ class LiveView:
         try:
             self._server = Server((host, port), Handler)
         except OSError as error:
-            raise DriverError(f"live view at {host}:{port}: {error.strerror or error}; see --view") from None
+            raise UsageError(f"live view at {host}:{port}: {error.strerror or error}; see --view") from None
         self.url = f"http://{host}:{self._server.server_address[1]}"
         threading.Thread(target=self._server.serve_forever, name="live view", daemon=True).start()
         self._thread = threading.Thread(target=self._tell, name="live events", daemon=True)

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from uwbslam_jax.sim.scenario import INF, Lidar, Scenario, Uwb
 from uwbslam_jax.measurements import RangeMessage, ScanMessage
+from uwbslam_jax.sim.scenario import INF, Lidar, Scenario, Uwb
 from uwbslam_jax.sim.simulate import START_NS, beacon_positions, simulate
 
 _NEVER = 1e-9

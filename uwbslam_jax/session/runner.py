@@ -1,0 +1,127 @@
+"""Messages in, a Result out: frames -> session; steps groups of frames in batch mode, single ones online, the same bits."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import time
+from array import array
+from collections.abc import Iterable
+
+import numpy as np
+
+from uwbslam_jax.estimator.compiled import CompileClock
+from uwbslam_jax.estimator.state import Estimate
+from uwbslam_jax.evaluation import ROBOT, TRUTH, Truth, truth_row
+from uwbslam_jax.measurements import Message, ScanMessage, StampedFrame, TruthMessage
+from uwbslam_jax.numerics.row_buffer import Column
+from uwbslam_jax.result import Result
+from uwbslam_jax.session.frame_assembler import FrameAssembler
+from uwbslam_jax.session.result_builder import Facts, to_result
+from uwbslam_jax.session.session import CONTROL_EVERY, Session
+from uwbslam_jax.settings import Settings
+from uwbslam_jax.startup import static_geometry
+from uwbslam_jax.startup.static_geometry import Links, Relative
+
+_PEEK_SCANS = 10
+"""So many scans tell how many beams a scan has."""
+_VARYING_BEAMS = 1.25
+"""Room for larger scans than those peeked at, where the scanner's number of beams varies."""
+
+
+class Runner:
+    """Messages in, a Result out. Truth is set aside: the estimator never sees it.
+
+    Attributes:
+      session: the estimator's.
+      truths: rows of the ground truth so far.
+    """
+
+    def __init__(self, settings: Settings, clock: CompileClock, *, online: bool = False):
+        self.session = Session(settings)
+        self.truths = Column(dtype=TRUTH)
+        self._assembler = FrameAssembler(settings, self.session.config.max_ranges)
+        self._group = 1 if online else CONTROL_EVERY
+        self._clock = clock
+        self._waiting: list[StampedFrame] = []
+        self._step_ms = array("f")
+        self._links = Links()
+
+    def know(self, slots: dict[int, int]) -> None:
+        """Nodes that have slots before they are heard: those of an earlier run."""
+        self._assembler.slots.update(slots)
+
+    def add(self, message: Message) -> list[Estimate]:
+        """The estimates that a message leads to; in batch mode they come in groups."""
+        if isinstance(message, TruthMessage):
+            self.truths.append(truth_row(message))
+            return []
+        return [e for frame in self._assembler.add(message) for e in self._take(frame)]
+
+    def finish(self) -> list[Estimate]:
+        """The estimates of what still waits."""
+        estimates = [e for frame in self._assembler.flush() for e in self._take(frame)]
+        estimates += self._step()
+        self.session.finish()
+        return estimates
+
+    def result(self, facts: Facts) -> Result:
+        """The Result so far; odometry, step times and the drops of the frames are added to the facts.
+
+        While the robot waits for motion the beacons are those of the relative geometry, status "relative".
+        """
+        dropped = facts.dropped + self._assembler.dropped
+        warnings = [*facts.warnings, *self._assembler.warnings]
+        told = dataclasses.replace(
+            facts,
+            warnings=warnings,
+            dropped=dropped,
+            odometry_used=self._assembler.odometry_used,
+            step_ms=self._step_ms,
+            relative=self.relative(),
+        )
+        return to_result(self.session, told)
+
+    def relative(self) -> Relative | None:
+        """Geometry of the nodes among themselves while the robot rests; None where the ranges do not fix one."""
+        if self.session.decided_at is not None or self.session.status != "waiting for motion":
+            return None
+        settings = self.session.settings
+        return static_geometry.solve(
+            self._links.averages(), self._links.rise, origin=settings.robot.id, fit_offset=settings.uwb.fit_offset
+        )
+
+    def truth(self) -> Truth | None:
+        """The ground truth so far, None where there is none of the robot."""
+        known = bool(np.any(self.truths["node"] == ROBOT))
+        return Truth.from_rows(self.truths.values) if known else None
+
+    def _take(self, frame: StampedFrame) -> list[Estimate]:
+        self._waiting.append(frame)
+        return self._step() if len(self._waiting) == self._group else []
+
+    def _step(self) -> list[Estimate]:
+        frames, self._waiting = self._waiting, []
+        if not frames:
+            return []
+        begin, compiled = time.perf_counter(), self._clock.seconds
+        estimates = [self.session.step(frames[0])] if self._group == 1 else self.session.steps(frames)
+        seconds = time.perf_counter() - begin - (self._clock.seconds - compiled)
+        self._step_ms.extend([max(seconds, 0.0) * 1e3 / len(frames)] * len(frames))
+        if self.session.status == "waiting for motion":
+            for frame in frames:
+                self._links.hear(frame, self.session.params, self.session.config.nlos_gap_db)
+        return estimates
+
+
+def fit_beams(settings: Settings, messages: Iterable[Message]) -> Settings:
+    """Settings with no more slots for beams than the first scans need: a step's cost grows with them.
+
+    Where the scans differ in size there is room for larger ones; what still does not fit is thinned. Without any scan
+    the least will do.
+    """
+    scans = (m.ranges.size for m in messages if isinstance(m, ScanMessage) and m.ranges.size > 1)
+    sizes = list(itertools.islice(scans, _PEEK_SCANS))
+    beams = max(sizes, default=2) if len(set(sizes)) <= 1 else round(max(sizes) * _VARYING_BEAMS)
+    beams = min(beams, settings.lidar.max_beams)
+    return dataclasses.replace(settings, lidar=dataclasses.replace(settings.lidar, max_beams=beams))
