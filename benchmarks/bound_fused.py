@@ -14,9 +14,8 @@ from uwbslam_jax.estimator import match_fusion
 from uwbslam_jax.evaluation import align, wrap
 from uwbslam_jax.files.settings_file import from_dict
 from uwbslam_jax.settings import MapSettings
+from uwbslam_jax.sim import Scenario, make_scenario, settings_overrides, simulate
 from uwbslam_jax.sim.rays import strike
-from uwbslam_jax.sim.scenario import Scenario
-from uwbslam_jax.sim.simulate import scenario, settings_overrides, simulate
 
 _FIRST_SEED, _SECONDS = 500, 60.0
 _DT = 0.1
@@ -31,7 +30,7 @@ def fused(runs: int, bar: float) -> list[Metric]:
     """RMSE over bound of beacons and robot, and what the robot's is made of."""
     rows = []
     for seed in range(_FIRST_SEED, _FIRST_SEED + runs):
-        rows.append(_one(replace(scenario("hall", seed, _SECONDS))))
+        rows.append(_one(replace(make_scenario("hall", seed, _SECONDS))))
         print(f"fused {seed}: {np.round(rows[-1], 5).tolist()}", file=sys.stderr, flush=True)
     beacons, robot, heading, online, online_heading, least_beacons, least_robot, least_heading = np.array(rows).T
     deg, floor = 180 / np.pi, match_fusion._MATCH_FLOOR

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from uwbslam_jax.evaluation import wrap
-from uwbslam_jax.sim.scenario import Interval
+from uwbslam_jax.sim import Interval
 
 NAN = float("nan")
 _PUT_DOWN_S = 10.0

@@ -29,9 +29,9 @@ _FIGURES = {"pose_nees_ratio": "pose", "beacon_nees_ratio": "beacons"}
 def measure(name: str, seed: int, duration: float | None) -> dict[str, Any]:
     """NEES over dof of one run, with its errors."""
     from benchmarks import trials
-    from uwbslam_jax.sim.simulate import scenario
+    from uwbslam_jax.sim import make_scenario
 
-    figures = trials.measure(scenario(name, seed, duration)).figures
+    figures = trials.measure(make_scenario(name, seed, duration)).figures
     return {"seed": seed, **{key: figures[key] for key in (*_FIGURES, "robot_rmse_m", "beacon_mean_m")}}
 
 

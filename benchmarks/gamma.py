@@ -17,12 +17,9 @@ from benchmarks.metric import Metric, Report
 from uwbslam_jax.api import run_messages
 from uwbslam_jax.evaluation import evaluate
 from uwbslam_jax.settings import FilterSettings, Settings
-from uwbslam_jax.sim import worlds
-from uwbslam_jax.sim.catalogue import scenario, spread
+from uwbslam_jax.sim import Beacon, Lidar, Scenario, Uwb, make_scenario, simulate, spread, stream, worlds
 from uwbslam_jax.sim.paths import Along, Rest, Track
 from uwbslam_jax.sim.paths import Path as Way
-from uwbslam_jax.sim.scenario import Beacon, Lidar, Scenario, Uwb, stream
-from uwbslam_jax.sim.simulate import simulate
 
 GAMMAS = (1e-6, 0.01, 0.1, 0.65, 3.0, 15.0, 100.0)
 _SEEDS = (700, 701)
@@ -73,7 +70,7 @@ def made(place: str, ranges: str, seed: int) -> Scenario:
     many = ranges == "many ranges"
     uwb = Uwb()
     if place == "corridor":
-        base = scenario("corridor_recess", seed)
+        base = make_scenario("corridor_recess", seed)
         kept = base.beacons if many else base.beacons[::2]
         return replace(base, beacons=kept, uwb=uwb, lidar=Lidar(beams=361, reach=6.0))
     world = worlds.hall(seed, _SIZE_M)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.checks import Stay
+from uwbslam_jax.sim import Interval, Scenario
 from uwbslam_jax.sim.paths import Carried, Turn
-from uwbslam_jax.sim.scenario import Interval, Scenario
 
 _TURNED = np.deg2rad(1.0)
 _BACK_S = 2.0

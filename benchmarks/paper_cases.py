@@ -12,9 +12,8 @@ from benchmarks.trials import Outcome, measure
 from uwbslam_jax.evaluation import rigid_fit, wrap
 from uwbslam_jax.result import MapImage, Result
 from uwbslam_jax.settings import FilterSettings, Settings
+from uwbslam_jax.sim import Scenario, make_scenario
 from uwbslam_jax.sim.paths import Along, Path, Rest, Track
-from uwbslam_jax.sim.scenario import Scenario
-from uwbslam_jax.sim.simulate import scenario
 
 LENGTH = 22.7
 """Of the corridor [m]."""
@@ -111,14 +110,14 @@ _Run = tuple[str, Scenario, Outcome, Figures]
 
 
 def _workshop(seed: int) -> Iterator[_Run]:
-    made = _noisy(scenario("workshop", seed))
+    made = _noisy(make_scenario("workshop", seed))
     for setting, chosen in WORKSHOP.items():
         outcome = measure(made, Settings(filter=chosen))
         yield setting, made, outcome, _beacon_figures(outcome) | _of(outcome, "robot", "heading", "stray")
 
 
 def _dynamic(seed: int) -> Iterator[_Run]:
-    made = _noisy(scenario("schedule", seed))
+    made = _noisy(make_scenario("schedule", seed))
     for setting, chosen in DYNAMIC.items():
         outcome = measure(made, Settings(filter=chosen))
         seen = _seen(outcome, made)
@@ -127,7 +126,7 @@ def _dynamic(seed: int) -> Iterator[_Run]:
 
 
 def _speed(seed: int) -> Iterator[_Run]:
-    base = scenario("workshop", seed)
+    base = make_scenario("workshop", seed)
     track = Track(base.world.lap, 1.2, closed=True)
     for setting, (speed, rate, chosen) in SPEEDS.items():
         path = Path([Rest(4.0), Along(track, 0.0, track.length, speed), Rest(1.0)])
@@ -137,7 +136,7 @@ def _speed(seed: int) -> Iterator[_Run]:
 
 
 def _corridor(seed: int) -> Iterator[_Run]:
-    base = scenario("corridor", seed)
+    base = make_scenario("corridor", seed)
     first, second, *_ = intervals.stops(base)
     for setting, (sigma, rate, chosen) in CORRIDOR.items():
         made = _noisy(base, rate, sigma)

@@ -48,9 +48,9 @@ def judge(name: str, seed: int, duration: float | None) -> Seed:
     """Simulates one seed, runs it and judges it."""
     # here, not above: a worker process sets up JAX on its own
     from benchmarks.trials import measure
-    from uwbslam_jax.sim.simulate import scenario
+    from uwbslam_jax.sim import make_scenario
 
-    made = scenario(name, seed, duration)
+    made = make_scenario(name, seed, duration)
     outcome = measure(made)
     found = outcome.found(ROWS[name].checks, made)
     failed = ROWS[name].shortfalls(outcome.figures, found)

@@ -179,11 +179,10 @@ def _emulated(folder: Path, truth: Path) -> Iterator[tuple[str, str]]:
 def _robot_of_the_workshop(folder: Path) -> Path:
     """A settings file with what a user would configure for this robot."""
     from uwbslam_jax.files.settings_file import dump, from_dict
-    from uwbslam_jax.sim.scenario import settings_overrides
-    from uwbslam_jax.sim.simulate import scenario
+    from uwbslam_jax.sim import make_scenario, settings_overrides
 
     path = folder / "robot.toml"
-    path.write_text(dump(from_dict(settings_overrides(scenario("workshop", 0, None)))), encoding="utf-8")
+    path.write_text(dump(from_dict(settings_overrides(make_scenario("workshop", 0, None)))), encoding="utf-8")
     return path
 
 

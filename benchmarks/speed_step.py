@@ -23,7 +23,7 @@ from uwbslam_jax.session.frame_assembler import FrameAssembler
 from uwbslam_jax.session.runner import fit_beams
 from uwbslam_jax.session.session import Session
 from uwbslam_jax.settings import Settings
-from uwbslam_jax.sim.simulate import scenario, settings_overrides, simulate
+from uwbslam_jax.sim import make_scenario, settings_overrides, simulate
 
 _SECONDS = 150.0
 _WARM = 400
@@ -33,7 +33,7 @@ _REPEATS = 300
 
 def frames_of(name: str, seconds: float) -> tuple[Settings, list[StampedFrame]]:
     """The frames of a scenario's first seed, with the settings that they were made for."""
-    made = scenario(name, 0, seconds)
+    made = make_scenario(name, 0, seconds)
     messages = list(simulate(made))
     settings = fit_beams(from_dict(settings_overrides(made)), messages)
     assembler = FrameAssembler(settings, Session(settings).config.max_ranges)

@@ -9,7 +9,7 @@ from typing import Any
 
 from benchmarks import checks, intervals
 from benchmarks.checks import Trial
-from uwbslam_jax.sim.scenario import Scenario
+from uwbslam_jax.sim import Scenario
 
 
 @dataclass(frozen=True)

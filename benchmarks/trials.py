@@ -21,8 +21,7 @@ from uwbslam_jax.files.settings_file import from_dict
 from uwbslam_jax.measurements import Message
 from uwbslam_jax.result import MapImage, Result
 from uwbslam_jax.settings import Settings
-from uwbslam_jax.sim.scenario import Scenario
-from uwbslam_jax.sim.simulate import START_NS, settings_overrides, simulate
+from uwbslam_jax.sim import START_NS, Scenario, settings_overrides, simulate
 
 _MEMORY_SAMPLES = 100
 

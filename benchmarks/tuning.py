@@ -14,8 +14,7 @@ from benchmarks.metric import Metric, Report
 from benchmarks.tuning_cost import cost
 from benchmarks.tuning_links import links
 from uwbslam_jax.settings import Settings, UwbSettings
-from uwbslam_jax.sim.scenario import Lidar, Scenario, Uwb, Wheels
-from uwbslam_jax.sim.simulate import scenario, simulate
+from uwbslam_jax.sim import Lidar, Scenario, Uwb, Wheels, make_scenario, simulate
 
 _FIRST_SEED = 300
 """Other worlds than those of the scenario suite."""
@@ -56,7 +55,7 @@ def recovery(quick: bool) -> Iterator[Metric]:
 
     names, seconds = ("sigma_n", "sigma_w"), []
     for k, sigma in enumerate(_SIGMAS[: 1 if quick else None]):
-        messages = list(simulate(replace(scenario("hall", _FIRST_SEED + k, _SECONDS), uwb=Uwb(sigma=sigma))))
+        messages = list(simulate(replace(make_scenario("hall", _FIRST_SEED + k, _SECONDS), uwb=Uwb(sigma=sigma))))
         for off in _OFF[: 1 if quick else None]:
             begin = time.perf_counter()
             ready = prepare(messages, Settings(uwb=UwbSettings(sigma_n=off * sigma)))
@@ -90,7 +89,7 @@ def _pair(k: int) -> tuple[float, float, float]:
     from uwbslam_jax.tuning.rollout import prepare
 
     def hall(seed: int) -> Scenario:
-        return replace(scenario("hall", seed, _SECONDS), uwb=Uwb(sigma=_TRUE_N))
+        return replace(make_scenario("hall", seed, _SECONDS), uwb=Uwb(sigma=_TRUE_N))
 
     names, default = parameters.DEFAULTS["robust"], Settings()
     start = np.log([parameters.value(default, name) for name in names])
@@ -115,13 +114,13 @@ def mounting(quick: bool) -> Iterator[Metric]:
     """Biases and the LiDAR's place, found from nothing."""
     from uwbslam_jax.tuning.calibration import calibrate
 
-    errors, without = [], scenario("biased", _FIRST_SEED + 30)
+    errors, without = [], make_scenario("biased", _FIRST_SEED + 30)
 
     def names(made: Scenario) -> list[str]:
         return [*(f"bias.{n}" for n in made.uwb.bias), *_LIDAR]
 
     for seed in range(1 if quick else 5):
-        made = replace(scenario("biased", _FIRST_SEED + 30 + seed), lidar=Lidar(pose=_MOUNTED), wheels=Wheels())
+        made = replace(make_scenario("biased", _FIRST_SEED + 30 + seed), lidar=Lidar(pose=_MOUNTED), wheels=Wheels())
         found = calibrate(list(simulate(made)), Settings(), names(made))
         off = found.values - np.array([*made.uwb.bias.values(), *_MOUNTED])
         errors.append([np.sqrt(np.mean(off[:-3] ** 2)), np.hypot(*off[-3:-1]), np.rad2deg(abs(off[-1]))])

@@ -14,11 +14,8 @@ from benchmarks.metric import Metric
 from uwbslam_jax.estimator import state_vector
 from uwbslam_jax.mapping.tiled_map import TILE
 from uwbslam_jax.settings import Settings
-from uwbslam_jax.sim import worlds
-from uwbslam_jax.sim.catalogue import spread
+from uwbslam_jax.sim import Beacon, Scenario, simulate, spread, stream, worlds
 from uwbslam_jax.sim.paths import Along, Path, Rest, Track
-from uwbslam_jax.sim.scenario import Beacon, Scenario, stream
-from uwbslam_jax.sim.simulate import simulate
 from uwbslam_jax.tuning import parameters
 from uwbslam_jax.tuning.rollout import checkpointed, cropped, losses, prepare, rescaled
 

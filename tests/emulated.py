@@ -17,7 +17,7 @@ from uwbslam_drivers.emulators.serve import EMULATORS
 from uwbslam_drivers.hokuyo import UTM_30LX_EW, HokuyoDecoder
 from uwbslam_drivers.linktrack import LinkTrackDecoder
 from uwbslam_drivers.makerfabs import MakerfabsDecoder
-from uwbslam_jax.sim.simulate import Scenario, scenario
+from uwbslam_jax.sim import Scenario, make_scenario
 
 DEPARTURE = 1_800_000_000_000_000_000
 """Host time at which the robot sets off [ns]."""
@@ -67,7 +67,7 @@ LANGUAGES: dict[str, Language] = {
 
 @cache
 def workshop() -> Scenario:
-    return scenario("workshop", 3, 30.0)
+    return make_scenario("workshop", 3, 30.0)
 
 
 @cache

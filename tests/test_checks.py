@@ -16,8 +16,8 @@ from benchmarks.suite import ROWS, Check, Row
 from uwbslam_jax.evaluation import RigidMotion
 from uwbslam_jax.measurements import ScanMessage
 from uwbslam_jax.result import MapImage
+from uwbslam_jax.sim import SCENARIOS, make_scenario
 from uwbslam_jax.sim.paths import Turn
-from uwbslam_jax.sim.simulate import SCENARIOS, scenario
 
 T = np.arange(0.0, 60.0, 0.1)
 EXACT = 1e-9
@@ -137,24 +137,24 @@ def test_memory_that_grows_in_the_second_half() -> None:
 
 
 def test_what_is_to_happen_to_the_robot() -> None:
-    kidnapped = scenario("kidnapped", 1)
+    kidnapped = make_scenario("kidnapped", 1)
     (begin, end) = kidnapped.lidar.blind[0]
     assert intervals.carried(kidnapped) == [pytest.approx((begin, end))]
-    assert intervals.disturbed(scenario("blind", 1)) == [(70.0, 77.0)]
-    assert intervals.disturbed(scenario("hall", 1)) == []
-    made = scenario("straight", 2)
+    assert intervals.disturbed(make_scenario("blind", 1)) == [(70.0, 77.0)]
+    assert intervals.disturbed(make_scenario("hall", 1)) == []
+    made = make_scenario("straight", 2)
     turn = intervals.first_turn(made)
     pose = made.path.pose(np.array([0.0, turn]))
     assert np.hypot(*(pose[1] - pose[0])[:2]) == pytest.approx(12.0, abs=0.3)  # a corner's curvature begins at zero
     assert intervals.first_turn(replace(made, duration=10.0)) == math.inf
-    corridor = scenario("corridor", 0)
+    corridor = make_scenario("corridor", 0)
     at = corridor.path.pose(np.array(intervals.stops(corridor)))
     assert len(at) == 1 + len(corridor.path.spans(Turn))
     assert np.hypot(*np.diff(at[:, :2], axis=0).T) == pytest.approx(19.9, abs=0.05)
 
 
 def test_when_beacons_rest_and_are_carried_in_the_papers_schedule() -> None:
-    made = scenario("schedule", 0)
+    made = make_scenario("schedule", 0)
     assert intervals.carries(made) == [Stay(3, 46.6, 62.6), Stay(5, 13.5, 31.1)]
     rests = intervals.rests(made)
     assert [s for s in rests if s.node == 1] == [Stay(1, 0.0, made.duration)]

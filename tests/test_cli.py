@@ -26,7 +26,7 @@ from uwbslam_jax.session.result_builder import Facts, to_result
 from uwbslam_jax.session.runner import fit_beams
 from uwbslam_jax.session.session import CONTROL_EVERY, Session
 from uwbslam_jax.settings import Settings
-from uwbslam_jax.sim.simulate import scenario, settings_overrides, simulate
+from uwbslam_jax.sim import make_scenario, settings_overrides, simulate
 
 BEAMS = 181
 FRAMES = 135  # decided after 8 s; not a whole number of groups
@@ -46,7 +46,7 @@ def write(path: Path, messages: Sequence[Message]) -> Path:
 @pytest.fixture(scope="session")
 def messages() -> list[Message]:
     """A hall as a small scanner sees it, long enough to be decided, with ground truth."""
-    made = scenario("hall", 0, FRAMES / 10)
+    made = make_scenario("hall", 0, FRAMES / 10)
     return list(simulate(replace(made, lidar=replace(made.lidar, beams=BEAMS))))
 
 
@@ -259,7 +259,7 @@ class TestSimulate:
     def test_settings_that_fit_go_beside(self, tmp_path: Path) -> None:
         path = tmp_path / "made.mcap"
         assert main(["simulate", "lever_arms", "--seed", "3", "--duration", "1", "-o", str(path), "--quiet"]) == 0
-        made = scenario("lever_arms", 3, 1.0)
+        made = make_scenario("lever_arms", 3, 1.0)
         assert settings_file.load(path.with_suffix(".toml")) == settings_file.from_dict(settings_overrides(made))
         assert sum(isinstance(m, ScanMessage) for m in LogReader(path)) == 10
 

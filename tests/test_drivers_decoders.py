@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from uwbslam_drivers import dwm1000, dwm1001, linktrack, makerfabs, rplidar, scip
 from uwbslam_drivers.hokuyo import UTM_30LX_EW, HokuyoDecoder, Specification, parse_specification
 from uwbslam_jax.measurements import RangeMessage, ScanMessage
-from uwbslam_jax.sim.simulate import START_NS
+from uwbslam_jax.sim import START_NS
 
 MS = 1_000_000
 README = Path(__file__).parents[1] / "drivers" / "README.md"

@@ -26,7 +26,7 @@ from uwbslam_drivers.source import Reading, parse_url
 from uwbslam_jax.__main__ import main
 from uwbslam_jax.evaluation import Truth
 from uwbslam_jax.measurements import RangeMessage, ScanMessage
-from uwbslam_jax.sim.simulate import Scenario, scenario
+from uwbslam_jax.sim import Scenario, make_scenario
 
 MS = 1_000_000
 PATIENCE = 30.0
@@ -72,7 +72,7 @@ def collect(source: Source, enough: Callable[[list[Reading]], bool]) -> list[Rea
 
 
 def workshop(seconds: float = 60.0) -> Scenario:
-    return scenario("workshop", 0, seconds)
+    return make_scenario("workshop", 0, seconds)
 
 
 # Devices -------------------------------------------------------------------------------------------------------------

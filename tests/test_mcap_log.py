@@ -18,8 +18,9 @@ from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from uwbslam_jax.errors import LogError
 from uwbslam_jax.files import log_summary, mcap_container, ros_types
-from uwbslam_jax.files.mcap_log import LogError, LogReader, LogWriter
+from uwbslam_jax.files.mcap_log import LogReader, LogWriter
 from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, ScanMessage, TruthMessage
 
 T0 = 1_700_000_000_123_456_789  # ns; no float64 holds it

@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks.suite import ROWS
 from benchmarks.trials import measure
-from uwbslam_jax.sim.simulate import scenario
+from uwbslam_jax.sim import make_scenario
 
 BEAMS = 361
 """One size for all scenarios: the step is compiled once."""
@@ -34,7 +34,7 @@ SHORT = {
 @pytest.mark.parametrize("name", SHORT)
 def test_a_short_form_of_the_scenario_holds_its_bar(name: str, seed: int) -> None:
     duration, row = SHORT[name]
-    made = scenario(name, seed, duration)
+    made = make_scenario(name, seed, duration)
     made = replace(made, lidar=replace(made.lidar, beams=BEAMS))
     outcome = measure(made)
     found = outcome.found(row.checks, made)

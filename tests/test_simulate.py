@@ -13,18 +13,19 @@ import numpy as np
 import pytest
 
 from uwbslam_jax.measurements import OdometryMessage, RangeMessage, ScanMessage, TruthMessage
-from uwbslam_jax.sim import rays, worlds
-from uwbslam_jax.sim.paths import Along, Carried, Path, Rest, Track, Turn
-from uwbslam_jax.sim.simulate import (
+from uwbslam_jax.sim import (
     SCENARIOS,
     START_NS,
     Scenario,
     beacon_positions,
+    rays,
     scan_ranges,
     scenario,
     settings_overrides,
     simulate,
+    worlds,
 )
+from uwbslam_jax.sim.paths import Along, Carried, Path, Rest, Track, Turn
 
 ready = cache(scenario)
 WITHOUT_SCANS = 1e-3

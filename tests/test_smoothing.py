@@ -10,7 +10,7 @@ from uwbslam_jax.backend import smoothing
 from uwbslam_jax.backend.graph import Graph
 from uwbslam_jax.backend.range_means import RangeMeans
 from uwbslam_jax.numerics import sparse_least_squares
-from uwbslam_jax.numerics.se2_host import relative
+from uwbslam_jax.numerics.se2_host import between
 
 BEACONS = {1: np.array([-3.0, 5.0]), 2: np.array([9.0, 6.0]), 3: np.array([8.0, -4.0]), 4: np.array([-2.0, -3.0])}
 SIGMA_N = 0.1
@@ -46,7 +46,7 @@ def make(truth: np.ndarray, seed: int = 0, bias=None, sight: np.ndarray | None =
     spread = np.linalg.pinv(information)
     for new in range(1, len(truth)):
         for old in {new - 1, max(new - len(truth) // 2, 0)} - {new}:
-            z = relative(truth[old], truth[new]) + rng.multivariate_normal(np.zeros(3), spread)
+            z = between(truth[old], truth[new]) + rng.multivariate_normal(np.zeros(3), spread)
             graph.edges.append((old, new, z, information))
     for at in range(len(truth) - 1):
         for slot, spot in BEACONS.items():
@@ -98,7 +98,7 @@ def test_a_run_is_solved_to_millimetres() -> None:
 
 def nees(found: smoothing.Solution, truth: np.ndarray) -> float:
     """Squared Mahalanobis distance of the beacons, 8 degrees of freedom, in the frame of the first pose."""
-    to = relative(found.poses[0], np.column_stack([found.beacons, np.zeros(4)]))[:, :2]
+    to = between(found.poses[0], np.column_stack([found.beacons, np.zeros(4)]))[:, :2]
     true = np.array([turned(-truth[0, 2], BEACONS[slot] - truth[0, :2]) for slot, _ in found.nodes])
     e = np.array([turned(found.poses[0, 2], d) for d in to - true]).ravel()
     return float(e @ np.linalg.solve(found.cov[3:, 3:], e))
@@ -114,7 +114,7 @@ def test_edges_that_are_wrong_are_left_out() -> None:
     truth = loop()
     graph = make(truth)
     for k in range(10, 70, 15):
-        wrong = relative(truth[k - 8], truth[k]) + np.array([0.5, -0.4, 0.1])
+        wrong = between(truth[k - 8], truth[k]) + np.array([0.5, -0.4, 0.1])
         graph.edges.append((k - 8, k, wrong, graph.edges[0]["information"]))
     robot, beacons = apart(solved(graph), truth)
     assert np.sqrt(np.mean(robot**2)) < 0.015

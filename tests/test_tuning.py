@@ -16,7 +16,7 @@ from test_smoothing import BEACONS as SPOTS
 from uwbslam_jax.errors import ConfigError
 from uwbslam_jax.estimator import ranging
 from uwbslam_jax.files.settings_file import differences, from_dict
-from uwbslam_jax.numerics.se2_host import compose, relative
+from uwbslam_jax.numerics.se2_host import between, compose
 from uwbslam_jax.settings import Params, Settings
 from uwbslam_jax.tuning import calibration, fit, parameters, rollout
 from uwbslam_jax.tuning.likelihood import Objective, Score
@@ -193,13 +193,13 @@ def mounted(change: np.ndarray, bias: dict[int, float], *, wheels: bool):
     wrong = compose(truth, there)
     back = np.append(-rotated(-change[2], change[:2]), -change[2])
     rng = np.random.default_rng(5)
-    steps = np.vstack([np.zeros(3), relative(truth[:-1], truth[1:])])
+    steps = np.vstack([np.zeros(3), between(truth[:-1], truth[1:])])
     steps = 1.02 * steps + rng.normal(0, 0.003, steps.shape)
     graph.keyframes["pose"][:] = wrong
     if wheels:
         graph.keyframes["wheels"][:] = steps
-    between = graph.edges["between"]
-    between[:] = compose(compose(np.tile(back, (len(between), 1)), between), np.tile(change, (len(between), 1)))
+    edges = graph.edges["between"]
+    edges[:] = compose(compose(np.tile(back, (len(edges), 1)), edges), np.tile(change, (len(edges), 1)))
     for mean in graph.ranges.means:
         then = (1 - mean["share"]) * wrong[mean["at"]] + mean["share"] * wrong[mean["at"] + 1]
         antenna = then[:2] + rotated(then[2], ANTENNA)

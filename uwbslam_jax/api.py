@@ -9,14 +9,13 @@ import dataclasses
 import time
 from collections.abc import Callable, Iterable
 
-from uwbslam_jax.estimator.compiled import CompileClock
+from uwbslam_jax.errors import LogError
+from uwbslam_jax.estimator import CompileClock
 from uwbslam_jax.evaluation import Truth
-from uwbslam_jax.files.bag import Source
-from uwbslam_jax.files.mcap_log import LogError, LogReader
+from uwbslam_jax.files import LogReader, Source
 from uwbslam_jax.measurements import Message
 from uwbslam_jax.result import Result
-from uwbslam_jax.session.result_builder import Facts
-from uwbslam_jax.session.runner import Runner, fit_beams
+from uwbslam_jax.session import Facts, Runner, fit_beams
 from uwbslam_jax.settings import Settings
 
 _PROGRESS_EVERY = 100

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from uwbslam_jax.measurements import TruthMessage
-from uwbslam_jax.numerics.row_buffer import Column
+from uwbslam_jax.numerics import Column
 from uwbslam_jax.result import Result
 
 NAN = float("nan")

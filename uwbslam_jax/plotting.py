@@ -9,10 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from uwbslam_jax.mapping import Grid, Sweep
 from uwbslam_jax.mapping import grid as occupancy
-from uwbslam_jax.mapping.grid import Grid
-from uwbslam_jax.mapping.sweep import Sweep
-from uwbslam_jax.numerics.se2 import transform_points
+from uwbslam_jax.numerics import transform_points
 from uwbslam_jax.result import MapImage, Result, trinary
 
 TRACK, BEACON, END = "tab:blue", "tab:red", "tab:green"

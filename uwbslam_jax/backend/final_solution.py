@@ -13,8 +13,8 @@ import numpy as np
 from uwbslam_jax.backend.graph import Graph
 from uwbslam_jax.backend.range_means import Node
 from uwbslam_jax.backend.smoothing import Solution, solve
-from uwbslam_jax.estimator.published_frame import frame_motion, published
-from uwbslam_jax.numerics.se2_host import compose, numeric_jacobian, relative, turned, wrapped
+from uwbslam_jax.estimator import frame_motion, published
+from uwbslam_jax.numerics import between, compose, numeric_jacobian, turned, wrapped
 from uwbslam_jax.settings import Params
 
 
@@ -107,7 +107,7 @@ def _track(graph: Graph, after: np.ndarray, stamps: np.ndarray, poses: np.ndarra
     n = np.minimum(k + 1, last)
     n = np.where(broken[n], k, n)
     share = np.clip((stamps - keys[k]) / np.maximum(keys[n] - keys[k], 1), 0.0, 1.0)
-    ends = [compose(after[j], relative(before[j], poses)) for j in (k, n)]
+    ends = [compose(after[j], between(before[j], poses)) for j in (k, n)]
     turn = wrapped(ends[1][:, 2] - ends[0][:, 2])
     track = ends[0] + share[:, None] * np.column_stack([ends[1][:, :2] - ends[0][:, :2], turn])
     even = after[k, :2] + share[:, None] * (after[n, :2] - after[k, :2])

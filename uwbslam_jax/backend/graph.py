@@ -16,10 +16,9 @@ from scipy import sparse
 
 from uwbslam_jax.backend.range_means import RangeMeans
 from uwbslam_jax.backend.registration import View, register, view
-from uwbslam_jax.estimator.state import Estimate, map_pose
+from uwbslam_jax.estimator import Estimate, map_pose
 from uwbslam_jax.measurements import Scan, Snapshot, StampedFrame
-from uwbslam_jax.numerics.row_buffer import Column
-from uwbslam_jax.numerics.se2_host import relative, turned, wrapped
+from uwbslam_jax.numerics import Column, between, turned, wrapped
 from uwbslam_jax.settings import Config, Params
 
 _MOVED = (0.25, 0.2)
@@ -225,7 +224,7 @@ class Graph:
         if not old:
             return
         padded = (old * _TIES)[:_TIES]  # always as many: nothing is compiled again
-        guess = relative(self.keyframes["pose"][padded], self.keyframes["pose"][new])
+        guess = between(self.keyframes["pose"][padded], self.keyframes["pose"][new])
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *(self._view(params, k) for k in padded))
         found = jax.device_get(register(stacked, self._view(params, new), np.float32(guess)))
         believed = np.all(np.abs(found.pose - guess) < _BELIEVED, axis=1) & (found.share > _SHARE)

@@ -12,10 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uwbslam_jax.estimator.state import Estimate
+from uwbslam_jax.estimator import Estimate
 from uwbslam_jax.measurements import StampedFrame
-from uwbslam_jax.numerics.robust import mean_sigma
-from uwbslam_jax.numerics.row_buffer import Column
+from uwbslam_jax.numerics import Column, mean_sigma
 from uwbslam_jax.settings import Params
 
 _WINDOW = 21

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from uwbslam_jax.mapping.sweep import find_surface, stand_ins, undo_motion
+from uwbslam_jax.mapping import find_surface, stand_ins, undo_motion
 from uwbslam_jax.measurements import Snapshot
-from uwbslam_jax.numerics.se2 import transform_points
+from uwbslam_jax.numerics import transform_points
 from uwbslam_jax.settings import Params
 
 _POINTS = 361

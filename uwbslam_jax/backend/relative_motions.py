@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from uwbslam_jax.backend.graph import Graph
-from uwbslam_jax.numerics.se2_host import relative, turned, wrapped
+from uwbslam_jax.numerics import between, turned, wrapped
 
 _LOOSE_WHEELS = (0.03, 0.06, 0.02, 0.06)
 """Standard deviation of a step by wheels: floor and share of the way [m], floor and share of the turn [rad]."""
@@ -50,7 +50,7 @@ def steps(graph: Graph, poses: np.ndarray) -> Steps:
     """
     keys = graph.keyframes.values
     new = np.flatnonzero(~keys["broken"][1:]) + 1
-    stamp, matched = keys["stamp"] / 1e9, relative(keys["pose"][new - 1], keys["pose"][new])
+    stamp, matched = keys["stamp"] / 1e9, between(keys["pose"][new - 1], keys["pose"][new])
     rolled = graph.rolled()[new, None]
     z = np.where(rolled, keys["wheels"][new], matched)
     elapsed = np.minimum(stamp[new] - stamp[new - 1], _LONGEST_S)[:, None] * np.array([1.0, 1.0, 0.0])
@@ -75,7 +75,7 @@ def steps(graph: Graph, poses: np.ndarray) -> Steps:
 
 def _near(edges: np.ndarray, poses: np.ndarray) -> np.ndarray:
     """The edges that are not far from where the keyframes are."""
-    off = relative(poses[edges["old"]], poses[edges["new"]]) - edges["between"]
+    off = between(poses[edges["old"]], poses[edges["new"]]) - edges["between"]
     return edges[(np.hypot(off[:, 0], off[:, 1]) <= _ASTRAY[0]) & (np.abs(wrapped(off[:, 2])) <= _ASTRAY[1])]
 
 

@@ -18,13 +18,9 @@ from uwbslam_jax import process
 from uwbslam_jax.backend.final_solution import Question, framed_solution
 from uwbslam_jax.backend.graph import Graph
 from uwbslam_jax.backend.smoothing import Solution
-from uwbslam_jax.estimator import state_vector
-from uwbslam_jax.estimator.published_frame import anchored
-from uwbslam_jax.estimator.state import State
-from uwbslam_jax.mapping.grid import Grid
-from uwbslam_jax.mapping.tiled_map import Tiles, draw_onto, redraw
-from uwbslam_jax.numerics.robust import SIGMA_ENOUGH_M, largest_sigma
-from uwbslam_jax.numerics.se2_host import compose, relative, wrapped
+from uwbslam_jax.estimator import State, anchored, state_vector
+from uwbslam_jax.mapping import Grid, Tiles, draw_onto, redraw
+from uwbslam_jax.numerics import SIGMA_ENOUGH_M, between, compose, largest_sigma, wrapped
 from uwbslam_jax.settings import Config, Params
 
 _LOOKS = 5
@@ -170,7 +166,7 @@ def take_over(config: Config, params: Params, revision: Revision, state: State, 
     solution, count = revision.solution, len(revision.solution.poses)
     slots, places, at = _current(solution, graph)
     last = graph.poses()[count - 1]
-    poses = np.concatenate([solution.poses, compose(solution.poses[-1], relative(last, graph.poses()[count:]))])
+    poses = np.concatenate([solution.poses, compose(solution.poses[-1], between(last, graph.poses()[count:]))])
     grid = revision.grid
     way = float(state.map_spread.way)
     for pose, snapshot in graph.seen(poses, count):
@@ -178,7 +174,7 @@ def take_over(config: Config, params: Params, revision: Revision, state: State, 
     s = state_vector.unpack(state.belief.mean)
     old = np.asarray(state_vector.robot_pose(state.belief.mean), float)
     on_map = old + np.asarray(s.map_error, float)
-    pose = compose(solution.poses[-1], relative(last, on_map))
+    pose = compose(solution.poses[-1], between(last, on_map))
     pose[2] = old[2] + wrapped(pose[2] - old[2])
     cov = _cov(solution, at, pose, float(np.sum(np.hypot(*np.diff(poses[count - 1 :, :2], axis=0).T))))
     others = [slot for slot in map(int, np.flatnonzero(np.asarray(state.active))) if slot > 0 and slot not in slots]

@@ -16,9 +16,19 @@ import numpy as np
 from uwbslam_jax.backend.graph import Graph
 from uwbslam_jax.backend.range_means import Node
 from uwbslam_jax.backend.relative_motions import even_drive, steps
-from uwbslam_jax.numerics.robust import DECIDED, mean_sigma, soften
-from uwbslam_jax.numerics.se2_host import relative, turned, wrapped
-from uwbslam_jax.numerics.sparse_least_squares import Sink, blocks, covariance, elimination, minimise
+from uwbslam_jax.numerics import (
+    DECIDED,
+    Sink,
+    between,
+    blocks,
+    covariance,
+    elimination,
+    mean_sigma,
+    minimise,
+    soften,
+    turned,
+    wrapped,
+)
 
 CALIBRATED_M = 1e-3
 """Standard deviation of a node's bias when ranges are taken to be calibrated [m]."""
@@ -231,11 +241,11 @@ class Problem:
     def _edge_rows(self, rows: Sink, poses, soft: float, part: slice) -> None:
         old, new, roots = self.old[part], self.new[part], self.roots[part]
         a, b = poses[old], poses[new]
-        e = relative(a, b) - self.between[part]
+        e = between(a, b) - self.between[part]
         e[:, 2] = wrapped(e[:, 2])
         c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
         zero, one = np.zeros_like(c), np.ones_like(c)
-        moved = relative(a, b)
+        moved = between(a, b)
         # derivatives of the relative pose by x, y, heading of the old and of the new keyframe
         by = [
             np.stack([-c, s, zero], -1),

@@ -12,8 +12,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uwbslam_jax.numerics.multilateration import Spot, fit, mirrored, multilaterate, settle
-from uwbslam_jax.numerics.robust import DECIDED, RANGE_FLOOR_M, SIGMA_ENOUGH_M, misfit
+from uwbslam_jax.numerics import (
+    DECIDED,
+    RANGE_FLOOR_M,
+    SIGMA_ENOUGH_M,
+    Spot,
+    fit,
+    mirrored,
+    misfit,
+    multilaterate,
+    settle,
+)
 
 TIME, OTHER, X, Y, DISTANCE, NORMALISED = range(6)
 MEMORY_S = 40.0

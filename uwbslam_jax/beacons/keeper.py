@@ -28,10 +28,9 @@ from uwbslam_jax.beacons.evidence import (
     resting_place,
 )
 from uwbslam_jax.beacons.range_table import Heard, heard
-from uwbslam_jax.estimator import ranging
-from uwbslam_jax.estimator.state import Estimate, State
+from uwbslam_jax.estimator import Estimate, State, ranging
 from uwbslam_jax.measurements import StampedFrame
-from uwbslam_jax.numerics.multilateration import locate
+from uwbslam_jax.numerics import locate
 from uwbslam_jax.settings import Params, Settings
 
 _SILENT_S = 3.0

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uwbslam_jax.estimator.state import Estimate
+from uwbslam_jax.estimator import Estimate
 from uwbslam_jax.measurements import StampedFrame
 from uwbslam_jax.settings import Params
 

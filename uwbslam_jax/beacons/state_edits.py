@@ -9,11 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from uwbslam_jax.beacons.evidence import OTHER, X, Y
-from uwbslam_jax.estimator import state_vector
-from uwbslam_jax.estimator.state import State
-from uwbslam_jax.numerics.gaussian import Gaussian
-from uwbslam_jax.numerics.multilateration import Spot
-from uwbslam_jax.numerics.robust import RANGE_FLOOR_M
+from uwbslam_jax.estimator import State, state_vector
+from uwbslam_jax.numerics import RANGE_FLOOR_M, Gaussian, Spot
 
 _RESTING_SPEED = 1e-4
 """Standard deviation of the velocity of a node at rest [m/s]."""

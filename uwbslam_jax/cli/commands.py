@@ -21,15 +21,12 @@ from uwbslam_jax.api import run_log
 from uwbslam_jax.cli.finish_run import accuracy, deliver, table
 from uwbslam_jax.cli.live_command import LiveOptions, live
 from uwbslam_jax.cli.tune_command import TuneOptions, tune
-from uwbslam_jax.errors import UsageError
+from uwbslam_jax.errors import LogError, UsageError
 from uwbslam_jax.evaluation import Truth, evaluate
-from uwbslam_jax.files import settings_file
-from uwbslam_jax.files.log_summary import format_summary, inspect
-from uwbslam_jax.files.mcap_log import LogError, LogReader, LogWriter
-from uwbslam_jax.files.run_folder import read_run
+from uwbslam_jax.files import LogReader, LogWriter, format_summary, inspect, read_run, settings_file
 from uwbslam_jax.measurements import Message, ScanMessage, TruthMessage
 from uwbslam_jax.settings import Settings
-from uwbslam_jax.sim.simulate import SCENARIOS, Scenario, scenario, settings_overrides, simulate
+from uwbslam_jax.sim import SCENARIOS, Scenario, make_scenario, settings_overrides, simulate
 
 
 @dataclass
@@ -223,7 +220,7 @@ def _scenario(name: str, seed: int, duration: float | None) -> Scenario:
         raise UsageError(f"seed {seed}: must not be negative")
     if duration is not None and not 0.0 < duration < 1e6:
         raise UsageError(f"duration {duration:g} s: must be greater than 0")
-    return scenario(name, seed, duration)
+    return make_scenario(name, seed, duration)
 
 
 def _record(made: Scenario, path: Path, quiet: bool) -> None:

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from uwbslam_jax.evaluation import Truth, consistency, evaluate
-from uwbslam_jax.files.run_folder import write_result
+from uwbslam_jax.files import write_result
 from uwbslam_jax.result import Result
-from uwbslam_jax.web.report import write_report
+from uwbslam_jax.web import write_report
 
 
 def deliver(result: Result, truth: Truth | None, out: Path, title: str) -> None:

@@ -22,16 +22,11 @@ from uwbslam_jax.cli.finish_run import deliver
 from uwbslam_jax.errors import UsageError
 from uwbslam_jax.evaluation import Truth
 from uwbslam_jax.files import settings_file
-from uwbslam_jax.live.devices import Devices
-from uwbslam_jax.live.live_run import LiveRun
-from uwbslam_jax.live.publisher import Publisher
-from uwbslam_jax.live.warm_up import rehearse
+from uwbslam_jax.live import Devices, LiveRun, Publisher, rehearse
 from uwbslam_jax.session import saved_state
 from uwbslam_jax.settings import Settings
-from uwbslam_jax.sim.scenario import settings_overrides
-from uwbslam_jax.sim.simulate import SCENARIOS, scenario
-from uwbslam_jax.web.live_page import LivePage
-from uwbslam_jax.web.server import LiveView, parse_address
+from uwbslam_jax.sim import SCENARIOS, make_scenario, settings_overrides
+from uwbslam_jax.web import LivePage, LiveView, parse_address
 
 _LOOPBACK, _PUBLISH_PORT = "127.0.0.1", 8766
 _EMULATE = """\
@@ -136,7 +131,7 @@ def _check(options: LiveOptions) -> Settings:
         raise UsageError("no device: give --lidar URL and --uwb URL, or --emulate workshop to try it without any")
     settings = options.settings
     if options.emulate is not None:  # what a user would configure for this robot
-        fits = settings_file.from_dict(settings_overrides(scenario(options.emulate, 0, None)))
+        fits = settings_file.from_dict(settings_overrides(make_scenario(options.emulate, 0, None)))
         uwb = dataclasses.replace(settings.uwb, height=fits.uwb.height | settings.uwb.height)
         settings = dataclasses.replace(settings, uwb=uwb)
         settings = settings if settings.robot != Settings().robot else dataclasses.replace(settings, robot=fits.robot)

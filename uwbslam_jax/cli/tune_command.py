@@ -18,15 +18,10 @@ from tyro.conf import Positional, arg
 from uwbslam_jax.cli import tune_pictures
 from uwbslam_jax.errors import ConfigError, RolloutError
 from uwbslam_jax.evaluation import Truth
-from uwbslam_jax.files import settings_file
-from uwbslam_jax.files.mcap_log import LogReader
+from uwbslam_jax.files import LogReader, settings_file
 from uwbslam_jax.measurements import Message, TruthMessage
 from uwbslam_jax.settings import Settings
-from uwbslam_jax.tuning import calibration, fit, parameters
-from uwbslam_jax.tuning.calibration import Calibration
-from uwbslam_jax.tuning.fit import Tuned
-from uwbslam_jax.tuning.likelihood import Objective, Piece, Score, piece
-from uwbslam_jax.tuning.rollout import prepare
+from uwbslam_jax.tuning import Calibration, Objective, Piece, Score, Tuned, calibration, fit, parameters, piece, prepare
 
 _BLOCK = 10
 """Frames whose log-likelihoods are averaged before their spread is taken: neighbours are alike."""

@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from uwbslam_jax.tuning.fit import Tuned
-from uwbslam_jax.tuning.likelihood import Objective
+from uwbslam_jax.tuning import Objective, Tuned
 
 _POINTS = 9
 _SIDE = 7

@@ -10,7 +10,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float
 
 from uwbslam_jax.mapping import grid as occupancy
-from uwbslam_jax.numerics.se2 import transform_points
+from uwbslam_jax.numerics import transform_points
 
 
 def lidar_gram(

@@ -17,8 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from uwbslam_jax.estimator import ranging, state_vector
 from uwbslam_jax.estimator.matching import Match
 from uwbslam_jax.measurements import Frame
-from uwbslam_jax.numerics.gaussian import Gaussian, inverse3, update_projected
-from uwbslam_jax.numerics.se2 import wrap_angle
+from uwbslam_jax.numerics import Gaussian, inverse3, update_projected, wrap_angle
 from uwbslam_jax.settings import Params
 
 SURPRISE = 30.0

@@ -9,8 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from uwbslam_jax.estimator import state_vector
 from uwbslam_jax.measurements import Odometry
-from uwbslam_jax.numerics import gaussian
-from uwbslam_jax.numerics.se2 import perpendicular, rotation, safe_norm
+from uwbslam_jax.numerics import gaussian, perpendicular, rotation, safe_norm
 from uwbslam_jax.settings import Params
 
 _COAST_S = 1.5

@@ -15,12 +15,9 @@ from jaxtyping import Array, Bool, Float, Int
 from uwbslam_jax.estimator import matching, ranging, state_vector
 from uwbslam_jax.estimator.lidar_objective import lidar_residual
 from uwbslam_jax.estimator.matching import Match
-from uwbslam_jax.mapping.grid import Grid
-from uwbslam_jax.mapping.sweep import Sweep
+from uwbslam_jax.mapping import Grid, Sweep
 from uwbslam_jax.measurements import Ranges
-from uwbslam_jax.numerics import gaussian
-from uwbslam_jax.numerics.gaussian import Gaussian
-from uwbslam_jax.numerics.se2 import gauge_pose, rotation
+from uwbslam_jax.numerics import Gaussian, gauge_pose, gaussian, rotation
 from uwbslam_jax.settings import Params
 
 _HELD = 1e3

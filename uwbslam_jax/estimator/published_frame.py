@@ -8,15 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from uwbslam_jax.estimator import state_vector
-from uwbslam_jax.numerics.gaussian import Gaussian
-from uwbslam_jax.numerics.se2_host import compose, rotation
+from uwbslam_jax.numerics import Gaussian, compose, rotation_matrix
 
 
 def frame_motion(beacons: np.ndarray, slots: Sequence[Hashable], frame_slots: Sequence[Hashable]) -> np.ndarray:
     """(3,) the rigid motion that puts one of the beacons (B, 2) at the origin and another on +x."""
     origin, along = (beacons[slots.index(s)] for s in frame_slots)
     theta = -np.arctan2(along[1] - origin[1], along[0] - origin[0])
-    return np.append(-rotation(theta) @ origin, theta)
+    return np.append(-rotation_matrix(theta) @ origin, theta)
 
 
 def published(x: np.ndarray, *, slots, frame_slots, onward) -> np.ndarray:
@@ -24,7 +23,7 @@ def published(x: np.ndarray, *, slots, frame_slots, onward) -> np.ndarray:
     beacons = x[3:].reshape(-1, 2)
     motion = frame_motion(beacons, slots, frame_slots)
     robot = compose(motion, compose(x[:3], onward))
-    return np.concatenate([robot, (beacons @ rotation(motion[2]).T + motion[:2]).ravel()])
+    return np.concatenate([robot, (beacons @ rotation_matrix(motion[2]).T + motion[:2]).ravel()])
 
 
 def anchored(
@@ -48,7 +47,7 @@ def anchored(
     pose, error = np.array(state_vector.pose_indices(nodes)), np.array(state_vector.map_error_indices(nodes))
     velocity, beacon_velocities = np.arange(2 * nodes, 2 * nodes + 2), np.arange(2 * nodes + 2, 4 * nodes)
     placed = np.concatenate([[2 * s, 2 * s + 1] for s in slots])
-    R = rotation(values[2] - old_pose[2])
+    R = rotation_matrix(values[2] - old_pose[2])
     mean[velocity] = R @ mean[velocity]
     moving = np.append(velocity, 4 * nodes + 1)
     motion_cov = P[np.ix_(moving, moving)]

@@ -11,8 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from uwbslam_jax.estimator import state_vector
 from uwbslam_jax.measurements import Leaf, Ranges
-from uwbslam_jax.numerics import gaussian
-from uwbslam_jax.numerics.se2 import perpendicular
+from uwbslam_jax.numerics import gaussian, perpendicular
 from uwbslam_jax.settings import Params
 
 _SOFT = 3.0

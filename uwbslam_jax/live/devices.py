@@ -6,7 +6,7 @@ import threading
 from collections.abc import Sequence
 
 from uwbslam_drivers import Source, open_source
-from uwbslam_jax.files.ros_types import recorded
+from uwbslam_jax.files import recorded
 from uwbslam_jax.live.message_queue import Inbox
 
 

@@ -18,20 +18,16 @@ import numpy as np
 
 from uwbslam_drivers.clock import host_time
 from uwbslam_jax import process
-from uwbslam_jax.estimator.compiled import CompileClock
-from uwbslam_jax.estimator.state import Estimate
+from uwbslam_jax.estimator import CompileClock, Estimate
 from uwbslam_jax.live.devices import Devices
 from uwbslam_jax.live.message_queue import Arrival, Inbox
 from uwbslam_jax.live.publisher import Publisher
 from uwbslam_jax.live.recorder import LogRecorder
 from uwbslam_jax.measurements import ScanMessage, StampedFrame
 from uwbslam_jax.result import Result
-from uwbslam_jax.session import saved_state
-from uwbslam_jax.session.result_builder import Facts
-from uwbslam_jax.session.runner import Runner
-from uwbslam_jax.session.saved_state import Locator, Saved
+from uwbslam_jax.session import Facts, Locator, Runner, Saved, saved_state
 from uwbslam_jax.settings import Settings
-from uwbslam_jax.web.live_page import LivePage, Status
+from uwbslam_jax.web import LivePage, Status
 
 _IDLE_S = 0.05
 _STATUS_S = 0.5

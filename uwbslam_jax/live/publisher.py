@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from uwbslam_jax.errors import UsageError
-from uwbslam_jax.estimator.state import Estimate
+from uwbslam_jax.estimator import Estimate
 from uwbslam_jax.files import result_log, ros_types
 from uwbslam_jax.measurements import StampedFrame
 from uwbslam_jax.result import BeaconEstimate
-from uwbslam_jax.session.session import Session
+from uwbslam_jax.session import Session
 
 BEACONS_S = 1.0
 MAP_S = 5.0

@@ -11,7 +11,8 @@ from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
-from uwbslam_jax.files.mcap_log import LogError, LogWriter
+from uwbslam_jax.errors import LogError
+from uwbslam_jax.files import LogWriter
 from uwbslam_jax.live.message_queue import Arrival
 from uwbslam_jax.settings import Settings
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 
-from uwbslam_jax.estimator.compiled import CompileClock
+from uwbslam_jax.estimator import CompileClock
 from uwbslam_jax.measurements import Message
-from uwbslam_jax.session.runner import Runner
+from uwbslam_jax.session import Runner
 from uwbslam_jax.settings import RobotSettings, Settings, UwbSettings
-from uwbslam_jax.sim.scenario import INF, Lidar
-from uwbslam_jax.sim.simulate import START_NS, scenario, simulate
+from uwbslam_jax.sim import INF, START_NS, Lidar, make_scenario, simulate
 
 _RATE = 5.0
 """Scans a second: few, as each is traced through a world [Hz]."""
@@ -22,7 +21,7 @@ _LONGEST_S = 40.0
 
 def rehearse(settings: Settings) -> None:
     """Runs a simulated workshop with the sizes of these settings until its frame is decided and a little longer."""
-    made = scenario("workshop", 0, _LONGEST_S)
+    made = make_scenario("workshop", 0, _LONGEST_S)
     made = dataclasses.replace(made, lidar=Lidar(rate=_RATE, beams=settings.lidar.max_beams, reach=INF))
     sizes = UwbSettings(max_beacons=settings.uwb.max_beacons, sigma_n=settings.uwb.sigma_n)
     settings = dataclasses.replace(settings, robot=RobotSettings(), uwb=sizes)

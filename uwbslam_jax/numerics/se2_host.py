@@ -32,7 +32,7 @@ def numeric_jacobian(function, x: np.ndarray) -> np.ndarray:
 
 
 def compose(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Host version of geometry.compose for (..., 3) poses in float64; headings are not wrapped."""
+    """Poses (..., 3) given in the frames of poses a, as se2.compose; headings are not wrapped."""
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
     x = a[..., 0] + c * b[..., 0] - s * b[..., 1]
     y = a[..., 1] + s * b[..., 0] + c * b[..., 1]
@@ -40,21 +40,16 @@ def compose(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Host version of geometry.between for (..., 3) poses in float64; headings are not wrapped."""
+    """Poses b in the frames of poses a, both (..., 3), as se2.between; headings are not wrapped."""
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
     dx, dy = b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]
     return np.stack([c * dx + s * dy, -s * dx + c * dy, b[..., 2] - a[..., 2]], axis=-1)
 
 
-def rotation(theta: float) -> np.ndarray:
+def rotation_matrix(theta: float) -> np.ndarray:
     """(2, 2) rotation by an angle [rad]."""
     c, s = np.cos(theta), np.sin(theta)
     return np.array([[c, -s], [s, c]])
-
-
-def relative(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Poses b in the frames of poses a, both (..., 3); the angle is not wrapped."""
-    return np.concatenate([turned(-a[..., 2], b[..., :2] - a[..., :2]), b[..., 2:] - a[..., 2:]], axis=-1)
 
 
 def wrapped(angle):

@@ -9,11 +9,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from uwbslam_jax.estimator.state import Estimate, map_pose, sight
+from uwbslam_jax.estimator import Estimate, map_pose, sight
 from uwbslam_jax.measurements import StampedFrame
-from uwbslam_jax.numerics.row_buffer import Column
-from uwbslam_jax.numerics.se2_host import carried_along
-from uwbslam_jax.startup.adopt import Adopted
+from uwbslam_jax.numerics import Column, carried_along
+from uwbslam_jax.startup import Adopted
 
 _RESIDUALS_EVERY_S = 1.0
 """Of each pair one is kept this often: frames at fixed times would see the same pairs again and again, or none."""

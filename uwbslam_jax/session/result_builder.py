@@ -15,7 +15,7 @@ from uwbslam_jax import __version__
 from uwbslam_jax.result import BeaconEstimate, Result
 from uwbslam_jax.session.history import History
 from uwbslam_jax.session.session import Session
-from uwbslam_jax.startup.static_geometry import Relative
+from uwbslam_jax.startup import Relative
 
 _NO_SCAN = "no scan: the track is that of odometry and ranges, the map is empty"
 _NO_TRACK = "no scan and no odometry: there is no track, the map is empty"

@@ -10,18 +10,16 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from uwbslam_jax.estimator.compiled import CompileClock
-from uwbslam_jax.estimator.state import Estimate
+from uwbslam_jax.estimator import CompileClock, Estimate
 from uwbslam_jax.evaluation import ROBOT, TRUTH, Truth, truth_row
 from uwbslam_jax.measurements import Message, ScanMessage, StampedFrame, TruthMessage
-from uwbslam_jax.numerics.row_buffer import Column
+from uwbslam_jax.numerics import Column
 from uwbslam_jax.result import Result
 from uwbslam_jax.session.frame_assembler import FrameAssembler
 from uwbslam_jax.session.result_builder import Facts, to_result
 from uwbslam_jax.session.session import CONTROL_EVERY, Session
 from uwbslam_jax.settings import Settings
-from uwbslam_jax.startup import static_geometry
-from uwbslam_jax.startup.static_geometry import Links, Relative
+from uwbslam_jax.startup import Links, Relative, static_geometry
 
 _PEEK_SCANS = 10
 """So many scans tell how many beams a scan has."""

@@ -19,11 +19,10 @@ import numpy as np
 
 from uwbslam_jax.beacons import state_edits
 from uwbslam_jax.errors import RunError
-from uwbslam_jax.estimator.state import State, init
-from uwbslam_jax.mapping.tiled_map import Tiles
+from uwbslam_jax.estimator import State, init
+from uwbslam_jax.mapping import Tiles
 from uwbslam_jax.measurements import RangeMessage
-from uwbslam_jax.numerics.gaussian import Gaussian
-from uwbslam_jax.numerics.multilateration import locate
+from uwbslam_jax.numerics import Gaussian, locate
 from uwbslam_jax.session.session import Session
 from uwbslam_jax.settings import Settings, make_config, make_params
 

@@ -15,22 +15,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from uwbslam_jax.backend.final_solution import Hindsight, Question, look_back
-from uwbslam_jax.backend.graph import Graph
-from uwbslam_jax.backend.range_means import Node, RangeMeans
-from uwbslam_jax.backend.revision import Reviser, Revision, is_news, take_over
-from uwbslam_jax.backend.smoothing import Solution
-from uwbslam_jax.beacons.evidence import MEMORY_S
-from uwbslam_jax.beacons.keeper import BeaconKeeper
-from uwbslam_jax.estimator import compiled, state_vector
-from uwbslam_jax.estimator.state import Estimate, State, init
-from uwbslam_jax.mapping.tiled_map import Tiles, redraw
+from uwbslam_jax.backend import (
+    Graph,
+    Hindsight,
+    Node,
+    Question,
+    RangeMeans,
+    Reviser,
+    Revision,
+    Solution,
+    is_news,
+    look_back,
+    take_over,
+)
+from uwbslam_jax.beacons import MEMORY_S, BeaconKeeper
+from uwbslam_jax.estimator import Estimate, State, compiled, init, state_vector
+from uwbslam_jax.mapping import Tiles, redraw
 from uwbslam_jax.measurements import StampedFrame
 from uwbslam_jax.session.history import History
 from uwbslam_jax.settings import Params, Settings, make_config, make_params
-from uwbslam_jax.startup import decide
-from uwbslam_jax.startup.adopt import adopt
-from uwbslam_jax.startup.keyframe_buffer import Buffer
+from uwbslam_jax.startup import Buffer, adopt, decide
 
 CONTROL_EVERY = compiled.GROUP
 """Frames between two looks of the host."""

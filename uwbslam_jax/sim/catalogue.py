@@ -17,7 +17,7 @@ from uwbslam_jax.sim.scenario import INF, Beacon, Follow, Lidar, Scenario, Uwb, 
 from uwbslam_jax.sim.worlds import World
 
 
-def scenario(name: str, seed: int = 0, duration_s: float | None = None) -> Scenario:
+def make_scenario(name: str, seed: int = 0, duration_s: float | None = None) -> Scenario:
     """A ready-made scenario; each seed has its own world, beacons and orientation. `SCENARIOS` lists the names.
 
     duration_s: instead of the scenario's own; what happens once (but for the paper's schedule) happens sooner then.

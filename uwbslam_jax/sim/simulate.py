@@ -13,13 +13,9 @@ from itertools import combinations
 import numpy as np
 
 from uwbslam_jax.measurements import NAN, Message, OdometryMessage, RangeMessage, ScanMessage, TruthMessage
-from uwbslam_jax.sim.catalogue import SCENARIOS as SCENARIOS
-from uwbslam_jax.sim.catalogue import scenario as scenario
 from uwbslam_jax.sim.paths import smooth
 from uwbslam_jax.sim.rays import blocked, strike
-from uwbslam_jax.sim.scenario import Beacon, Follow, Interval, Lidar, Uwb, stream
-from uwbslam_jax.sim.scenario import Scenario as Scenario
-from uwbslam_jax.sim.scenario import settings_overrides as settings_overrides
+from uwbslam_jax.sim.scenario import Beacon, Follow, Interval, Lidar, Scenario, Uwb, stream
 
 START_NS = 1_700_000_000_123_456_789
 """Stamp of a simulation's time 0 [ns]; float32 and even float64 seconds cannot hold it exactly, as in life."""

@@ -8,11 +8,9 @@ from functools import partial
 import jax.numpy as jnp
 import numpy as np
 
-from uwbslam_jax.estimator import state_vector
-from uwbslam_jax.estimator.published_frame import anchored, frame_motion, published
-from uwbslam_jax.estimator.state import State
-from uwbslam_jax.mapping.tiled_map import Tiles, redraw
-from uwbslam_jax.numerics.se2_host import between, carried_along, compose, numeric_jacobian
+from uwbslam_jax.estimator import State, anchored, frame_motion, published, state_vector
+from uwbslam_jax.mapping import Tiles, redraw
+from uwbslam_jax.numerics import between, carried_along, compose, numeric_jacobian
 from uwbslam_jax.settings import Config, Params
 from uwbslam_jax.startup.keyframe_buffer import Buffer
 from uwbslam_jax.startup.placement import Placement

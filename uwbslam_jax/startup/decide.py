@@ -12,10 +12,9 @@ from functools import partial
 
 import numpy as np
 
-from uwbslam_jax.estimator.published_frame import published
+from uwbslam_jax.estimator import published
 from uwbslam_jax.measurements import Ranges
-from uwbslam_jax.numerics.robust import CALIBRATED_M, DECIDED, SIGMA_ENOUGH_M, largest_sigma
-from uwbslam_jax.numerics.se2_host import numeric_jacobian
+from uwbslam_jax.numerics import CALIBRATED_M, DECIDED, SIGMA_ENOUGH_M, largest_sigma, numeric_jacobian
 from uwbslam_jax.startup.adopt import _last_and_beacons
 from uwbslam_jax.startup.hypotheses import explanations
 from uwbslam_jax.startup.keyframe_buffer import Buffer

@@ -12,9 +12,7 @@ from itertools import pairwise, product
 
 import numpy as np
 
-from uwbslam_jax.numerics.multilateration import multilaterate
-from uwbslam_jax.numerics.robust import soften
-from uwbslam_jax.numerics.se2_host import rotation, turned
+from uwbslam_jax.numerics import multilaterate, rotation_matrix, soften, turned
 from uwbslam_jax.startup.placement import Placement, Problem
 
 _ANGLES = 72
@@ -180,7 +178,7 @@ def _ways(problem: Problem, keys: np.ndarray, path: np.ndarray) -> np.ndarray:
     for m, (a, b) in enumerate(pairwise(keys)):
         for k in range(a, b):  # steps add up
             root = np.linalg.inv(problem.roots[k])
-            R = rotation(problem.track[k, 2])
+            R = rotation_matrix(problem.track[k, 2])
             cov[m] += R @ (root @ root.T)[:2, :2] @ R.T
     weight = np.linalg.inv(cov + 2 * _PATH_SIGMA**2 * np.eye(2))
     angles = np.linspace(0.0, 2 * np.pi, _ANGLES, endpoint=False)

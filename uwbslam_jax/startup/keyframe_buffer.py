@@ -13,8 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from uwbslam_jax.measurements import Ranges, Snapshot, StampedFrame
-from uwbslam_jax.numerics.robust import mean_sigma
-from uwbslam_jax.numerics.se2_host import turned
+from uwbslam_jax.numerics import mean_sigma, turned
 
 _MOVED = (0.25, 0.2)
 """A keyframe every so much of path or turn [m, rad]."""

@@ -10,9 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from uwbslam_jax.numerics.multilateration import multilaterate
-from uwbslam_jax.numerics.robust import CALIBRATED_M, DECIDED, largest_sigma, soften
-from uwbslam_jax.numerics.se2_host import rotation, turned
+from uwbslam_jax.numerics import CALIBRATED_M, DECIDED, largest_sigma, multilaterate, rotation_matrix, soften, turned
 from uwbslam_jax.startup.keyframe_buffer import Buffer, Keyframe
 
 _MOST_MOVES = 20
@@ -283,7 +281,7 @@ def _steps(keys: list[Keyframe]) -> tuple[np.ndarray, np.ndarray]:
         u = turned(-a.pose[2], b.pose[:2] - a.pose[:2])
         steps[k] = np.append(u, b.pose[2] - a.pose[2])
         turn = np.eye(3)
-        turn[:2, :2] = rotation(a.pose[2]).T
+        turn[:2, :2] = rotation_matrix(a.pose[2]).T
         length, angle = np.hypot(*u), abs(steps[k, 2])
         elapsed = (b.frame.stamp - a.frame.stamp) / 1e9
         # where the match says nothing, wheels or the motion model still bound the step; where it says much, the map

@@ -17,7 +17,7 @@ from scipy.optimize import least_squares
 from scipy.sparse.csgraph import shortest_path
 
 from uwbslam_jax.measurements import StampedFrame
-from uwbslam_jax.numerics.robust import RANGE_FLOOR_M
+from uwbslam_jax.numerics import RANGE_FLOOR_M
 from uwbslam_jax.settings import Params
 
 _KEPT = 1024

@@ -12,13 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwbslam_jax.backend.graph import Graph
-from uwbslam_jax.backend.smoothing import Solution
+from uwbslam_jax.backend import Graph, Solution
 from uwbslam_jax.errors import RolloutError
 from uwbslam_jax.measurements import Message
-from uwbslam_jax.session.frame_assembler import FrameAssembler
-from uwbslam_jax.session.runner import fit_beams
-from uwbslam_jax.session.session import Session
+from uwbslam_jax.session import FrameAssembler, Session, fit_beams
 from uwbslam_jax.settings import Params, Settings
 from uwbslam_jax.tuning import parameters
 from uwbslam_jax.tuning.mounting import FIXED, Mounting

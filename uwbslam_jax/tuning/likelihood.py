@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from uwbslam_jax.estimator.state import State
+from uwbslam_jax.estimator import State
 from uwbslam_jax.evaluation import Truth
 from uwbslam_jax.measurements import Frame
 from uwbslam_jax.settings import Config, Params

@@ -7,11 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwbslam_jax.backend.graph import Graph
-from uwbslam_jax.backend.smoothing import Problem, Solution
-from uwbslam_jax.numerics.robust import soften
-from uwbslam_jax.numerics.se2_host import compose, relative, turned, wrapped
-from uwbslam_jax.numerics.sparse_least_squares import Sink, covariance, minimise
+from uwbslam_jax.backend import Graph, Problem, Solution
+from uwbslam_jax.numerics import Sink, between, compose, covariance, minimise, soften, turned, wrapped
 from uwbslam_jax.settings import Params
 
 _SCALE = 0.1
@@ -118,10 +115,10 @@ class Mounting:
         robot's a turn of the frame would turn the residuals, and pass for something that they tell."""
         p = self.problem
         keep = p.soft | ~self._rolled()[p.new]
-        old, new, between, roots, soft = (a[keep] for a in (p.old, p.new, p.between, p.roots, p.soft))
+        old, new, measured, roots, soft = (a[keep] for a in (p.old, p.new, p.between, p.roots, p.soft))
         columns = [*_columns(3 * old, 3), *_columns(3 * new, 3), *_shared(self.lidar, 3, len(old))]
         own, back = self.lidar0[None], _inverse(self.lidar0[None])
-        motion = compose(compose(back, between), own)
+        motion = compose(compose(back, measured), own)
 
         def on_robot(m: Array) -> Array:
             return compose(compose(own, m), back)
@@ -131,7 +128,7 @@ class Mounting:
 
         def residual(v: Array) -> Array:
             lidar = self.lidar0 + v[:, 6:]
-            e = relative(compose(v[:, :3], lidar), compose(v[:, 3:6], lidar)) - motion
+            e = between(compose(v[:, :3], lidar), compose(v[:, 3:6], lidar)) - motion
             e[:, 2] = wrapped(e[:, 2])
             white = np.einsum("eij,ej->ei", roots, e)
             inside = np.where(soft, 1.0 + np.sum(white**2, axis=1) / self.stage[0] ** 2, 1.0)
@@ -206,7 +203,7 @@ class Mounting:
 
 def _slip(old: Array, new: Array, scales: Array, wheels: Array) -> Array:
     """Motion by wheels of these scales less the motion measured, (n, 3)."""
-    moved = relative(old, new)
+    moved = between(old, new)
     moved[:, 2] = wrapped(moved[:, 2])
     e = moved * (1.0 + scales[:, [0, 0, 1]]) - wheels
     e[:, 2] = wrapped(e[:, 2])

@@ -20,14 +20,10 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from uwbslam_jax.errors import RolloutError
-from uwbslam_jax.estimator.state import State
-from uwbslam_jax.estimator.step import step
-from uwbslam_jax.mapping.grid import EPOCH_LEVEL, Grid
-from uwbslam_jax.mapping.tiled_map import TILE
+from uwbslam_jax.estimator import State, step
+from uwbslam_jax.mapping import EPOCH_LEVEL, TILE, Grid
 from uwbslam_jax.measurements import Frame, Message, RangeMessage, StampedFrame
-from uwbslam_jax.session.frame_assembler import FrameAssembler
-from uwbslam_jax.session.runner import fit_beams
-from uwbslam_jax.session.session import CONTROL_EVERY, Session
+from uwbslam_jax.session import CONTROL_EVERY, FrameAssembler, Session, fit_beams
 from uwbslam_jax.settings import Config, Params, Settings
 
 _SETTLED = 30

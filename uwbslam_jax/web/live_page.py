@@ -16,12 +16,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from uwbslam_jax.estimator.state import Estimate
-from uwbslam_jax.mapping.grid import Grid
-from uwbslam_jax.mapping.tiled_map import Tiles
+from uwbslam_jax.estimator import Estimate
+from uwbslam_jax.mapping import Grid, Tiles
 from uwbslam_jax.measurements import StampedFrame
 from uwbslam_jax.result import BeaconEstimate
-from uwbslam_jax.session.session import Session
+from uwbslam_jax.session import Session
 from uwbslam_jax.web import page
 from uwbslam_jax.web.page_data import extent, numbers, picture
 

@@ -21,8 +21,7 @@ from uwbslam_drivers.emulators.plugs import Plug, PtyPlug, TcpPlug
 from uwbslam_drivers.emulators.robot import Departure, DeviceTime, write_truth
 from uwbslam_drivers.emulators.serve import EMULATORS, Server
 from uwbslam_drivers.source import DEVICES
-from uwbslam_jax.sim.scenario import Scenario
-from uwbslam_jax.sim.simulate import SCENARIOS, scenario
+from uwbslam_jax.sim import SCENARIOS, Scenario, make_scenario
 
 LOOPBACK = "127.0.0.1"
 _LOOK = 0.2
@@ -107,7 +106,7 @@ def _check(options: EmulateOptions) -> Scenario:
     for name, repeated in (("pause", options.pause), ("unplug", options.unplug)):
         if repeated is not None and not 0.0 < repeated[1] < repeated[0]:
             raise DriverError(f"{name} {repeated[0]:g} {repeated[1]:g}: the second must be between 0 and the first")
-    return scenario(options.world, options.seed, options.duration)
+    return make_scenario(options.world, options.seed, options.duration)
 
 
 def _servers(options: EmulateOptions, made: Scenario, departure: Departure, faults: Faults) -> Iterator[Server]:

@@ -13,7 +13,7 @@ from uwbslam_drivers.emulators import robot
 from uwbslam_drivers.emulators.robot import DeviceTime
 from uwbslam_drivers.hokuyo import MS, UTM_30LX_EW, WRAP, Specification
 from uwbslam_jax.measurements import ScanMessage
-from uwbslam_jax.sim.scenario import Scenario
+from uwbslam_jax.sim import Scenario
 
 PROCESSING = 1 * MS
 """A reply follows the last beam after this time [ns]."""

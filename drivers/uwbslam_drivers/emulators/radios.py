@@ -10,7 +10,7 @@ from uwbslam_drivers import dwm1000, linktrack
 from uwbslam_drivers.emulators import robot
 from uwbslam_drivers.emulators.robot import DeviceTime
 from uwbslam_jax.measurements import RangeMessage
-from uwbslam_jax.sim.scenario import Scenario
+from uwbslam_jax.sim import Scenario
 
 PROCESSING = 1_000_000
 """A range is sent after this time [ns]."""

@@ -14,8 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from uwbslam_jax.measurements import RangeMessage, ScanMessage
-from uwbslam_jax.sim.scenario import INF, Lidar, Scenario, Uwb
-from uwbslam_jax.sim.simulate import START_NS, beacon_positions, simulate
+from uwbslam_jax.sim import INF, START_NS, Lidar, Scenario, Uwb, beacon_positions, simulate
 
 _NEVER = 1e-9
 """Rate of a device that is left out [Hz]."""

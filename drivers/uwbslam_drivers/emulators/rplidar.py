@@ -9,8 +9,7 @@ import numpy as np
 
 from uwbslam_drivers import rplidar as protocol
 from uwbslam_drivers.emulators.robot import DeviceTime
-from uwbslam_jax.sim.rays import cast
-from uwbslam_jax.sim.scenario import Scenario, stream
+from uwbslam_jax.sim import Scenario, cast, stream
 
 RATE = 10.0
 """Turns a second."""

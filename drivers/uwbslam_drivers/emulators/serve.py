@@ -20,7 +20,7 @@ from uwbslam_drivers.emulators.radios import (
 )
 from uwbslam_drivers.emulators.robot import Departure, DeviceTime
 from uwbslam_drivers.emulators.rplidar import EmulatedRplidar
-from uwbslam_jax.sim.scenario import Scenario, stream
+from uwbslam_jax.sim import Scenario, stream
 
 _POLL = 0.02
 
