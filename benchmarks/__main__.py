@@ -2,7 +2,7 @@
 
 With --gate the exit status is 1 where a figure misses its bar, or a ratio is worse than the committed baseline by more
 than its tolerance; --baseline puts this run's ratios into the baseline. How far off the answers are is
-`python -m benchmarks.scenarios` and `.recordings`.
+`python -m benchmarks.accuracy.scenarios` and `.recordings`.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ NAMES = {
     "gamma": "preset paper: error against gamma by features and ranges",
     "paper": "every table and figure of the paper in simulation (20 minutes)",
 }
-_OTHERS = ("bound", "tuning", "gamma", "paper")
-"""Not about speed: their modules are called as they are."""
+_THEORY = ("bound", "tuning", "gamma", "paper")
+"""Measured in `theory`; the others in `speed`."""
 
 
 def main() -> int:
@@ -43,8 +43,8 @@ def main() -> int:
     parser.add_argument("--baseline", action="store_true", help="make this run's ratios the baseline")
     parser.add_argument("--quick", action="store_true", help="less of everything, to try it out: nothing is written")
     options = parser.parse_args()
-    module = options.name if options.name in _OTHERS else f"speed_{options.name}"
-    report = importlib.import_module(f"benchmarks.{module}").measure(quick=options.quick)
+    wing = "theory" if options.name in _THEORY else "speed"
+    report = importlib.import_module(f"benchmarks.{wing}.{options.name}").measure(quick=options.quick)
     if options.quick:
         for m in report.metrics:
             print(f"{m.name}: {m.value:.4g} {m.unit}")

@@ -27,7 +27,7 @@ _SECONDS = 60.0
 _SIZE_M = (12.0, 18.0)
 PLACES = ("feature-rich hall", "feature-poor hall", "corridor")
 RANGES = ("few ranges", "many ranges")
-PICTURE = Path(__file__).parents[1] / "docs" / "images" / "gamma.png"
+PICTURE = Path(__file__).parents[2] / "docs" / "images" / "gamma.png"
 
 
 def measure(*, quick: bool) -> Report:

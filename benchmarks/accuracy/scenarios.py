@@ -1,6 +1,6 @@
 """How far off the answer is in the simulated scenarios, against the bar of each, with the defaults.
 
-`python -m benchmarks.scenarios` runs every row with 5 seeds and writes results/scenarios.md and .json; names pick rows
+`python -m benchmarks.accuracy.scenarios` runs every row with 5 seeds and writes results/scenarios.md and .json; names pick rows
 and write nothing. Each seed has its own world, beacons and orientation. Exit status 1 if a bar is missed.
 """
 
@@ -15,8 +15,8 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from typing import Any
 
-from benchmarks.sharpness import STRAY_M
-from benchmarks.suite import ROWS, STRAY, Row
+from benchmarks.accuracy.sharpness import STRAY_M
+from benchmarks.accuracy.suite import ROWS, STRAY, Row
 from benchmarks.tables import cell, line, plain, provenance, write
 from uwbslam_jax.process import prepare
 
@@ -47,7 +47,7 @@ _HIGHER_IS_BETTER = {"sharpness", "own_sharpness", "real_time_factor"}
 def judge(name: str, seed: int, duration: float | None) -> Seed:
     """Simulates one seed, runs it and judges it."""
     # here, not above: a worker process sets up JAX on its own
-    from benchmarks.trials import measure
+    from benchmarks.accuracy.trials import measure
     from uwbslam_jax.sim import make_scenario
 
     made = make_scenario(name, seed, duration)
@@ -143,7 +143,7 @@ def seed_table(rows: dict[str, list[Seed]]) -> str:
 def main() -> int:
     """Returns 0, or 1 where a bar is missed."""
     prepare()  # before JAX is imported, which reads it once
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.scenarios", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.accuracy.scenarios", description=__doc__)
     parser.add_argument("names", nargs="*", choices=[*ROWS, []], metavar="NAME", help=f"of {', '.join(ROWS)}")
     parser.add_argument("--seeds", type=int, default=5, help="run seeds 0 to this less one")
     parser.add_argument("--workers", type=int, default=1, help="processes; step times are honest with one only")

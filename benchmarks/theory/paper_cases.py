@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from benchmarks import intervals
-from benchmarks.trials import Outcome, measure
+from benchmarks.accuracy import intervals
+from benchmarks.accuracy.trials import Outcome, measure
 from uwbslam_jax.evaluation import rigid_fit, wrap
 from uwbslam_jax.result import MapImage, Result
 from uwbslam_jax.settings import FilterSettings, Settings

@@ -10,13 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
+from benchmarks.accuracy.public_logs import P2P_OFFSET, p2p
 from benchmarks.metric import Metric
-from benchmarks.public_logs import P2P_OFFSET, p2p
 from uwbslam_jax.estimator import ranging
 from uwbslam_jax.measurements import RangeMessage
 from uwbslam_jax.settings import Settings
 
-_DATA = Path(__file__).parents[2] / "shared" / "data" / "p2p"
+_DATA = Path(__file__).parents[3] / "shared" / "data" / "p2p"
 _FITTED = 0.75
 """First share of each link's exchanges."""
 _WIDE_M = 0.3

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from benchmarks.metric import Metric, Report, ratio
-from benchmarks.speed_scaling import Case, sized
+from benchmarks.speed.scaling import Case, sized
 from uwbslam_jax.settings import MapSettings, Settings, UwbSettings
 
 _RUNS = (1, 64, 1024, 4096)

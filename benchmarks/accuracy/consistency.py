@@ -1,6 +1,6 @@
 """Whether the covariances are what they say: NEES over degrees of freedom, its mean over many runs.
 
-`python -m benchmarks.consistency` runs 50 short laps of the hall and 10 rounds of the office and writes
+`python -m benchmarks.accuracy.consistency` runs 50 short laps of the hall and 10 rounds of the office and writes
 results/consistency.md and .json; exit status 1 if a mean is out of bounds. The truth is put into the published frame by
 its own two beacons, not by a fit; only what was published after the frame was decided counts.
 """
@@ -28,7 +28,7 @@ _FIGURES = {"pose_nees_ratio": "pose", "beacon_nees_ratio": "beacons"}
 
 def measure(name: str, seed: int, duration: float | None) -> dict[str, Any]:
     """NEES over dof of one run, with its errors."""
-    from benchmarks import trials
+    from benchmarks.accuracy import trials
     from uwbslam_jax.sim import make_scenario
 
     figures = trials.measure(make_scenario(name, seed, duration)).figures
@@ -69,7 +69,7 @@ def table(found: dict[str, list[dict[str, Any]]], facts: dict[str, str]) -> str:
 def main() -> int:
     """Returns 0, or 1 where a mean is out of bounds."""
     prepare()  # before JAX is imported, which reads it once
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.consistency", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.accuracy.consistency", description=__doc__)
     parser.add_argument("--runs", type=int, default=math.inf, help="at most so many a scenario: nothing is written")
     options = parser.parse_args()
     found: dict[str, list[dict[str, Any]]] = {}

@@ -1,6 +1,6 @@
 """The scenario suite in a smaller form: two seeds, shortened recordings, every third beam, the suite's own bars.
 
-Seed 0 laps counter-clockwise and seed 1 clockwise. The whole suite is `python -m benchmarks.scenarios`.
+Seed 0 laps counter-clockwise and seed 1 clockwise. The whole suite is `python -m benchmarks.accuracy.scenarios`.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ from dataclasses import replace
 
 import pytest
 
-from benchmarks.suite import ROWS
-from benchmarks.trials import measure
+from benchmarks.accuracy.suite import ROWS
+from benchmarks.accuracy.trials import measure
 from uwbslam_jax.sim import make_scenario
 
 BEAMS = 361

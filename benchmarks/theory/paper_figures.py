@@ -8,8 +8,8 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 
-from benchmarks import paper_cases as cases
-from benchmarks.paper_cases import Case, Seen
+from benchmarks.theory import paper_cases as cases
+from benchmarks.theory.paper_cases import Case, Seen
 from uwbslam_jax.plotting import show_map, show_track
 from uwbslam_jax.result import trinary
 
@@ -17,7 +17,7 @@ matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 
-IMAGES = Path(__file__).parents[1] / "docs" / "images"
+IMAGES = Path(__file__).parents[2] / "docs" / "images"
 
 
 def draw(runs: Sequence[Case]) -> None:

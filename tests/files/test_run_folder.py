@@ -282,7 +282,7 @@ class TestResultLog:
 def test_the_foxglove_layout_shows_what_is_there(run: Path) -> None:
     """Its panels name topics of result.mcap, and the recording's own scans."""
     reader = pytest.importorskip("mcap_ros2.reader")
-    layout = json.loads((Path(__file__).parents[1] / "docs" / "foxglove.json").read_text(encoding="utf-8"))
+    layout = json.loads((Path(__file__).parents[2] / "docs" / "foxglove.json").read_text(encoding="utf-8"))
     panels = layout["configById"]
     named = {path["value"].split(".")[0] for path in panels["Plot!uwbslam-error"]["paths"]}
     named |= set(panels["3D!uwbslam"]["topics"]) | {panels["DiagnosticStatusPanel!uwbslam"]["topicToRender"]}

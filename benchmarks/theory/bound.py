@@ -19,9 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from benchmarks.bound_fused import fused
-from benchmarks.bound_recursion import Covariances, recursion
 from benchmarks.metric import Metric, Report
+from benchmarks.theory.bound_fused import fused
+from benchmarks.theory.bound_recursion import Covariances, recursion
 from uwbslam_jax.estimator import match_fusion, motion, ranging, state_vector
 from uwbslam_jax.measurements import Ranges, empty_frame
 from uwbslam_jax.numerics.gaussian import Gaussian, symmetric_root
@@ -40,7 +40,7 @@ _PRIOR = {"place": 0.05, "beacon": 0.1, "speed": 0.3, "heading": 0.05, "rate": 0
 _FRAME_M = 1e-4
 """Of the three coordinates that make the frame: the first beacon at the origin, the second on +x [m]."""
 _BAR, _BAR_FUSED = 1.15, 2.0
-PICTURE = Path(__file__).parents[1] / "docs" / "images" / "bound.png"
+PICTURE = Path(__file__).parents[2] / "docs" / "images" / "bound.png"
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from uwbslam_jax.measurements import RangeMessage, ScanMessage
 from uwbslam_jax.sim import START_NS
 
 MS = 1_000_000
-README = Path(__file__).parents[1] / "drivers" / "README.md"
+README = Path(__file__).parents[2] / "drivers" / "README.md"
 languages = pytest.mark.parametrize("name", LANGUAGES)
 
 

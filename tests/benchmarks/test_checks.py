@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks import checks, consistency, intervals, sharpness
-from benchmarks.checks import Stay, Trial
+from benchmarks.accuracy import checks, consistency, intervals, sharpness
+from benchmarks.accuracy.checks import Stay, Trial
+from benchmarks.accuracy.scenarios import seed_table, summary_table, verdict, worst_and_median
+from benchmarks.accuracy.suite import ROWS, Check, Row
 from benchmarks.readme import section
-from benchmarks.scenarios import seed_table, summary_table, verdict, worst_and_median
-from benchmarks.suite import ROWS, Check, Row
 from uwbslam_jax.evaluation import RigidMotion
 from uwbslam_jax.measurements import ScanMessage
 from uwbslam_jax.result import MapImage

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from test_without_lidar import SCALE, driven
 
-from benchmarks import batch_solution
-from benchmarks.public_logs import DRIVEN, P2P_BAR_M, p2p
-from benchmarks.without_lidar import orthogonal_rms, rest_rows, tables
+from benchmarks.accuracy import batch_solution
+from benchmarks.accuracy.public_logs import DRIVEN, P2P_BAR_M, p2p
+from benchmarks.accuracy.without_lidar import orthogonal_rms, rest_rows, tables
 from uwbslam_jax.evaluation import Truth, absolute_trajectory_error
 from uwbslam_jax.measurements import OdometryMessage, RangeMessage, TruthMessage
 from uwbslam_jax.startup import static_geometry

@@ -1,6 +1,6 @@
 """Figures of the public recordings without LiDAR: a robot with wheels and ranges, and nodes at rest.
 
-Rows for `benchmarks.recordings`; a folder that is absent gives the reason instead.
+Rows for `benchmarks.accuracy.recordings`; a folder that is absent gives the reason instead.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import batch_solution
-from benchmarks.public_logs import DRIVEN, P2P_BAR_M, PublicLog, p2p
+from benchmarks.accuracy import batch_solution
+from benchmarks.accuracy.public_logs import DRIVEN, P2P_BAR_M, PublicLog, p2p
 from benchmarks.tables import cell, line
 from uwbslam_jax.api import run_messages
 from uwbslam_jax.evaluation import evaluate

@@ -20,7 +20,7 @@ import jax
 import numpy as np
 
 from benchmarks.metric import Metric, Report, ratio
-from benchmarks.speed_scaling import Case, sized
+from benchmarks.speed.scaling import Case, sized
 from uwbslam_jax.files.mcap_log import LogReader
 from uwbslam_jax.session.frame_assembler import FrameAssembler
 from uwbslam_jax.session.session import Session

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.checks import NAN, Trial, rms_outside
-from benchmarks.intervals import disturbed
-from benchmarks.sharpness import occupied, own_fit, sharpness, stray, wall_distances
-from benchmarks.suite import Check
+from benchmarks.accuracy.checks import NAN, Trial, rms_outside
+from benchmarks.accuracy.intervals import disturbed
+from benchmarks.accuracy.sharpness import occupied, own_fit, sharpness, stray, wall_distances
+from benchmarks.accuracy.suite import Check
 from uwbslam_jax.api import run_messages
 from uwbslam_jax.evaluation import RigidMotion, Truth, align, consistency, evaluate, wrap
 from uwbslam_jax.files.settings_file import from_dict

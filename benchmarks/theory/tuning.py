@@ -11,8 +11,8 @@ import jax
 import numpy as np
 
 from benchmarks.metric import Metric, Report
-from benchmarks.tuning_cost import cost
-from benchmarks.tuning_links import links
+from benchmarks.theory.tuning_cost import cost
+from benchmarks.theory.tuning_links import links
 from uwbslam_jax.settings import Settings, UwbSettings
 from uwbslam_jax.sim import Lidar, Scenario, Uwb, Wheels, make_scenario, simulate
 
@@ -82,7 +82,7 @@ def transfer(quick: bool) -> Iterator[Metric]:
 
 def _pair(k: int) -> tuple[float, float, float]:
     """Gain in log-likelihood a frame, robot and beacons over what the defaults give."""
-    from benchmarks.trials import measure as run
+    from benchmarks.accuracy.trials import measure as run
     from uwbslam_jax.tuning import parameters
     from uwbslam_jax.tuning.fit import fit
     from uwbslam_jax.tuning.likelihood import Objective, piece

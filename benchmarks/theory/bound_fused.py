@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.bound_recursion import recursion
 from benchmarks.metric import Metric
+from benchmarks.theory.bound_recursion import recursion
 from uwbslam_jax.api import run_messages
 from uwbslam_jax.estimator import match_fusion
 from uwbslam_jax.evaluation import align, wrap

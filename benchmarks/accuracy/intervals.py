@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.checks import Stay
+from benchmarks.accuracy.checks import Stay
 from uwbslam_jax.sim import Interval, Scenario
 from uwbslam_jax.sim.paths import Carried, Turn
 

@@ -11,10 +11,10 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 
 import numpy as np
 
-from benchmarks import paper_cases as cases
 from benchmarks.metric import Metric, Report
-from benchmarks.paper_cases import Case, run_seed
 from benchmarks.tables import cell, line
+from benchmarks.theory import paper_cases as cases
+from benchmarks.theory.paper_cases import Case, run_seed
 
 _FIRST, _SEEDS = 900, 10
 _THEIRS: dict[tuple[str, str], dict[str, str]] = {
@@ -53,7 +53,7 @@ def measure(*, quick: bool) -> Report:
             runs += done.result()
             print(*jobs[done], file=sys.stderr, flush=True)
     if not quick:
-        from benchmarks.paper_figures import draw
+        from benchmarks.theory.paper_figures import draw
 
         draw(runs)
     found: dict[tuple[str, str], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))

@@ -1,6 +1,6 @@
 """How far off the answer is on recordings with known truth, with the defaults, with and without their odometry.
 
-`python -m benchmarks.recordings FOLDER` runs every NAME.mcap below FOLDER that has a NAME.truth.npz beside it, and the
+`python -m benchmarks.accuracy.recordings FOLDER` runs every NAME.mcap below FOLDER that has a NAME.truth.npz beside it, and the
 public logs without LiDAR that lie in FOLDER, and writes results/recordings.md and .json.
 """
 
@@ -30,7 +30,7 @@ _COLUMNS = {
 
 def measure(log: Path, *, odometry: bool) -> dict[str, float | None]:
     """Figures of one run of a recording."""
-    from benchmarks.sharpness import scan_misfit
+    from benchmarks.accuracy.sharpness import scan_misfit
     from uwbslam_jax.api import run_log
     from uwbslam_jax.evaluation import Truth, consistency, evaluate
     from uwbslam_jax.files.mcap_log import LogReader
@@ -55,7 +55,7 @@ def measure(log: Path, *, odometry: bool) -> dict[str, float | None]:
 def main() -> None:
     """The command line."""
     prepare()  # before JAX is imported, which reads it once
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.recordings", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.accuracy.recordings", description=__doc__)
     parser.add_argument("folder", type=Path)
     folder = parser.parse_args().folder
     logs = [log for log in sorted(folder.rglob("*.mcap")) if log.with_suffix(".truth.npz").exists()]
@@ -84,7 +84,7 @@ def main() -> None:
     for row in rows:
         cells = [cell(row[key], digits) for key, (_, digits) in _COLUMNS.items()]
         lines.append(line([str(row["recording"]), "used" if row["odometry"] else "left out", *cells]))
-    from benchmarks import without_lidar
+    from benchmarks.accuracy import without_lidar
 
     driven, rest = list(without_lidar.driven_rows(folder)), list(without_lidar.rest_rows(folder))
     lines += without_lidar.tables(driven, rest)

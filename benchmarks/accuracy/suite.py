@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from benchmarks import checks, intervals
-from benchmarks.checks import Trial
+from benchmarks.accuracy import checks, intervals
+from benchmarks.accuracy.checks import Trial
 from uwbslam_jax.sim import Scenario
 
 

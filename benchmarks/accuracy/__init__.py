@@ -1,0 +1,1 @@
+"""How near to the truth: scenarios with bars, recordings, consistency."""

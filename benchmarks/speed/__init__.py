@@ -1,0 +1,1 @@
+"""How fast: a step, a recording, a live run, start-up."""

@@ -1,0 +1,1 @@
+"""What is possible: bounds, the paper's tables, what tuning finds."""
