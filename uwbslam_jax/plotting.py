@@ -9,8 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from uwbslam_jax.mapping import Grid, Sweep
-from uwbslam_jax.mapping import grid as occupancy
+from uwbslam_jax.mapping import Grid, Sweep, grid as occupancy
 from uwbslam_jax.numerics import transform_points
 from uwbslam_jax.result import MapImage, Result, trinary
 

@@ -12,8 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.metric import Metric, Report, ratio, spread
-from uwbslam_jax.estimator import compiled, motion, ranging, state_vector
-from uwbslam_jax.estimator import step as step_module
+from uwbslam_jax.estimator import compiled, motion, ranging, state_vector, step as step_module
 from uwbslam_jax.files.settings_file import from_dict
 from uwbslam_jax.mapping import grid
 from uwbslam_jax.mapping.sweep import undo_motion

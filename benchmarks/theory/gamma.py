@@ -18,8 +18,7 @@ from uwbslam_jax.api import run_messages
 from uwbslam_jax.evaluation import evaluate
 from uwbslam_jax.settings import FilterSettings, Settings
 from uwbslam_jax.sim import Beacon, Lidar, Scenario, Uwb, make_scenario, simulate, spread, stream, worlds
-from uwbslam_jax.sim.paths import Along, Rest, Track
-from uwbslam_jax.sim.paths import Path as Way
+from uwbslam_jax.sim.paths import Along, Path as Way, Rest, Track
 
 GAMMAS = (1e-6, 0.01, 0.1, 0.65, 3.0, 15.0, 100.0)
 _SEEDS = (700, 701)

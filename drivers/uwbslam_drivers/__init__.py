@@ -1,4 +1,3 @@
 """Drivers: bytes of LiDARs and UWB radios become host messages. `open_source` opens a device by its URL."""
 
-from uwbslam_drivers.source import Source as Source
-from uwbslam_drivers.source import open_source as open_source
+from uwbslam_drivers.source import Source as Source, open_source as open_source

@@ -11,8 +11,7 @@ import fuzz_drivers
 import numpy as np
 import pytest
 from emulated import DEPARTURE, LANGUAGES, SHOWS, decode, held, spoken, stream, workshop
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from uwbslam_drivers import dwm1000, dwm1001, linktrack, makerfabs, rplidar, scip
 from uwbslam_drivers.hokuyo import UTM_30LX_EW, HokuyoDecoder, Specification, parse_specification

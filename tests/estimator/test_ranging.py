@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 import small_room as room
 from derivatives import assert_gradient, double
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from scipy.stats import norm
 
 from uwbslam_jax.estimator import motion, ranging, state_vector

@@ -14,8 +14,7 @@ from derivatives import assert_reverse, double, value_and_gradient
 from uwbslam_jax import estimator
 from uwbslam_jax.estimator import state_vector
 from uwbslam_jax.estimator.state_vector import Nodes
-from uwbslam_jax.mapping import grid as occupancy
-from uwbslam_jax.mapping import undo_motion
+from uwbslam_jax.mapping import grid as occupancy, undo_motion
 from uwbslam_jax.measurements import Odometry, Scan
 from uwbslam_jax.settings import Config, Params, Settings, UwbSettings, make_params
 

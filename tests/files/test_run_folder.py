@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from uwbslam_jax.errors import RunError
 from uwbslam_jax.files.run_folder import read_run, read_trajectory, write_result, write_trajectory

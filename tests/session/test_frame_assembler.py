@@ -6,8 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from uwbslam_jax.measurements import OdometryMessage, RangeMessage, ScanMessage, StampedFrame, TruthMessage
 from uwbslam_jax.session.frame_assembler import FrameAssembler, pad_scan

@@ -10,8 +10,7 @@ import small_room as room
 from derivatives import assert_reverse, double, value_and_gradient
 from scipy.integrate import quad
 from test_slam import BEACONS, FLAT, PAIRS, PARAMS, knowing, room_map  # noqa: F401
-from test_smoothing import ANTENNA, K, loop, make, solved
-from test_smoothing import BEACONS as SPOTS
+from test_smoothing import ANTENNA, BEACONS as SPOTS, K, loop, make, solved
 
 from uwbslam_jax.errors import ConfigError
 from uwbslam_jax.estimator import ranging

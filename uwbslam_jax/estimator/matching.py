@@ -12,8 +12,7 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
 from uwbslam_jax.estimator.lidar_objective import lidar_gram, lidar_residual, prior_residual
-from uwbslam_jax.mapping import Grid, Surface, Sweep
-from uwbslam_jax.mapping import grid as occupancy
+from uwbslam_jax.mapping import Grid, Surface, Sweep, grid as occupancy
 from uwbslam_jax.numerics import Gaussian, rotation, symmetric_root, transform_points, wrap_angle
 
 _MOVES = (6, 5, 5)

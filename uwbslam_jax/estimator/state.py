@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from uwbslam_jax.estimator import match_fusion, ranging, state_vector
-from uwbslam_jax.mapping import Grid
-from uwbslam_jax.mapping import grid as occupancy
+from uwbslam_jax.mapping import Grid, grid as occupancy
 from uwbslam_jax.numerics import Gaussian
 from uwbslam_jax.settings import Config
 

@@ -18,8 +18,7 @@ from uwbslam_jax.estimator import match_fusion, matching, motion, paper, ranging
 from uwbslam_jax.estimator.batched_cond import seldom
 from uwbslam_jax.estimator.matching import Match
 from uwbslam_jax.estimator.state import Estimate, State
-from uwbslam_jax.mapping import find_surface, undo_motion
-from uwbslam_jax.mapping import grid as occupancy
+from uwbslam_jax.mapping import find_surface, grid as occupancy, undo_motion
 from uwbslam_jax.measurements import Frame
 from uwbslam_jax.numerics import Gaussian, rotation, safe_norm, transform_points, wrap_angle
 from uwbslam_jax.settings import Config, Params

@@ -1,40 +1,52 @@
 """Mathematics that knows no robot."""
 
 from uwbslam_jax.numerics import gaussian as gaussian
-from uwbslam_jax.numerics.gaussian import Gaussian as Gaussian
-from uwbslam_jax.numerics.gaussian import inverse3 as inverse3
-from uwbslam_jax.numerics.gaussian import symmetric_root as symmetric_root
-from uwbslam_jax.numerics.gaussian import update_projected as update_projected
-from uwbslam_jax.numerics.multilateration import Spot as Spot
-from uwbslam_jax.numerics.multilateration import fit as fit
-from uwbslam_jax.numerics.multilateration import locate as locate
-from uwbslam_jax.numerics.multilateration import mirrored as mirrored
-from uwbslam_jax.numerics.multilateration import multilaterate as multilaterate
-from uwbslam_jax.numerics.multilateration import settle as settle
-from uwbslam_jax.numerics.robust import CALIBRATED_M as CALIBRATED_M
-from uwbslam_jax.numerics.robust import DECIDED as DECIDED
-from uwbslam_jax.numerics.robust import RANGE_FLOOR_M as RANGE_FLOOR_M
-from uwbslam_jax.numerics.robust import SIGMA_ENOUGH_M as SIGMA_ENOUGH_M
-from uwbslam_jax.numerics.robust import largest_sigma as largest_sigma
-from uwbslam_jax.numerics.robust import mean_sigma as mean_sigma
-from uwbslam_jax.numerics.robust import misfit as misfit
-from uwbslam_jax.numerics.robust import soften as soften
+from uwbslam_jax.numerics.gaussian import (
+    Gaussian as Gaussian,
+    inverse3 as inverse3,
+    symmetric_root as symmetric_root,
+    update_projected as update_projected,
+)
+from uwbslam_jax.numerics.multilateration import (
+    Spot as Spot,
+    fit as fit,
+    locate as locate,
+    mirrored as mirrored,
+    multilaterate as multilaterate,
+    settle as settle,
+)
+from uwbslam_jax.numerics.robust import (
+    CALIBRATED_M as CALIBRATED_M,
+    DECIDED as DECIDED,
+    RANGE_FLOOR_M as RANGE_FLOOR_M,
+    SIGMA_ENOUGH_M as SIGMA_ENOUGH_M,
+    largest_sigma as largest_sigma,
+    mean_sigma as mean_sigma,
+    misfit as misfit,
+    soften as soften,
+)
 from uwbslam_jax.numerics.row_buffer import Column as Column
-from uwbslam_jax.numerics.se2 import gauge_pose as gauge_pose
-from uwbslam_jax.numerics.se2 import perpendicular as perpendicular
-from uwbslam_jax.numerics.se2 import rotation as rotation
-from uwbslam_jax.numerics.se2 import safe_norm as safe_norm
-from uwbslam_jax.numerics.se2 import transform_points as transform_points
-from uwbslam_jax.numerics.se2 import wrap_angle as wrap_angle
-from uwbslam_jax.numerics.se2_host import between as between
-from uwbslam_jax.numerics.se2_host import carried_along as carried_along
-from uwbslam_jax.numerics.se2_host import compose as compose
-from uwbslam_jax.numerics.se2_host import numeric_jacobian as numeric_jacobian
-from uwbslam_jax.numerics.se2_host import rotation_matrix as rotation_matrix
-from uwbslam_jax.numerics.se2_host import turned as turned
-from uwbslam_jax.numerics.se2_host import wrapped as wrapped
-from uwbslam_jax.numerics.sparse_least_squares import Sink as Sink
-from uwbslam_jax.numerics.sparse_least_squares import blocks as blocks
-from uwbslam_jax.numerics.sparse_least_squares import covariance as covariance
-from uwbslam_jax.numerics.sparse_least_squares import elimination as elimination
-from uwbslam_jax.numerics.sparse_least_squares import minimise as minimise
+from uwbslam_jax.numerics.se2 import (
+    gauge_pose as gauge_pose,
+    perpendicular as perpendicular,
+    rotation as rotation,
+    safe_norm as safe_norm,
+    transform_points as transform_points,
+    wrap_angle as wrap_angle,
+)
+from uwbslam_jax.numerics.se2_host import (
+    between as between,
+    carried_along as carried_along,
+    compose as compose,
+    numeric_jacobian as numeric_jacobian,
+    rotation_matrix as rotation_matrix,
+    turned as turned,
+    wrapped as wrapped,
+)
+from uwbslam_jax.numerics.sparse_least_squares import (
+    Sink as Sink,
+    blocks as blocks,
+    covariance as covariance,
+    elimination as elimination,
+    minimise as minimise,
+)
