@@ -47,7 +47,7 @@ def test_dump_reads_back_to_the_same_settings(settings: Settings) -> None:
 def test_defaults_are_valid_and_round_trip_through_a_file(tmp_path: Path) -> None:
     path = tmp_path / "a.toml"
     path.write_text(settings_file.dump(Settings()), encoding="utf-8")
-    assert settings_file.load(path) == settings_file.check(Settings()) == settings_file.from_dict({})
+    assert settings_file.load_settings(path) == settings_file.check(Settings()) == settings_file.from_dict({})
 
 
 def test_the_design_example_loads(tmp_path: Path) -> None:
@@ -56,7 +56,7 @@ def test_the_design_example_loads(tmp_path: Path) -> None:
         "[robot]\nid = 0\nantenna = [0.16, 0, 1.12]\nlidar = [0.095, 0.0, 0.0]\n[uwb]\nsigma_n = 1\n"
         'height = {"1" = 1.94}\nbias = {"1" = 0.12}\n'
     )
-    settings = settings_file.load(str(path))
+    settings = settings_file.load_settings(str(path))
     assert settings.robot.antenna == (0.16, 0.0, 1.12)
     assert settings.uwb.sigma_n == 1.0
     assert type(settings.uwb.sigma_n) is float
@@ -119,6 +119,6 @@ def test_an_unreadable_file_is_a_config_error_that_names_it(
     if content is not None:
         path.write_bytes(content)
     with pytest.raises(ConfigError, match=message) as error:
-        settings_file.load(path)
+        settings_file.load_settings(path)
     assert str(path) in str(error.value)
     assert "\n" not in str(error.value)

@@ -1,91 +1,435 @@
-"""A recording through the estimator: messages -> frames -> session -> Result. Reads no other file and writes none.
+"""The front door: what scripts, notebooks, the command line and a live run call.
 
-Batch mode steps groups of frames at once, online mode steps frame by frame; both give the same bits.
+Batch mode steps groups of frames at once, online mode frame by frame; both give the same bits.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import time
-from collections.abc import Callable, Iterable
+import zipfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
 
-from uwbslam_jax.errors import LogError
+from uwbslam_jax import evaluation, result as data, sim, tuning
+from uwbslam_jax.errors import LogError, UsageError
 from uwbslam_jax.estimator import CompileClock
 from uwbslam_jax.evaluation import Truth
-from uwbslam_jax.files import LogReader, Source
-from uwbslam_jax.measurements import Message
-from uwbslam_jax.result import Result
-from uwbslam_jax.session import Facts, Runner, fit_beams
+from uwbslam_jax.files import LogReader, LogSummary, LogWriter, inspect_log, read_run, settings_file, write_result
+from uwbslam_jax.measurements import Message, ScanMessage, TruthMessage
+from uwbslam_jax.result import MapImage, RunStatus
+from uwbslam_jax.session import PEEK_SCANS, Facts, Runner, Saved, Update, fit_beams, saved_state
 from uwbslam_jax.settings import Settings
+from uwbslam_jax.tuning import Rollout, Tuned
+from uwbslam_jax.web import write_report
+
+Paths = str | Path | Sequence[str | Path]
+"""An MCAP file, the folder of a ROS 2 bag, or several files of one recording."""
+Progress = Callable[[int, int], object]
+"""Called now and then with the number of messages taken in and of all."""
 
 _PROGRESS_EVERY = 100
 """Messages between two reports of progress."""
+_PEEK_S = 1.0
+"""Measurements are held for at most so long until the number of beams of a scan is known [s, by their stamps]."""
 
 
-def run_log(
+@dataclass(slots=True)
+class Result(data.Result):
+    """What a run found, see `result.Result` for the arrays.
+
+    Attributes:
+      truth: where the recording has some, None otherwise.
+      state: what `resume` and `localize` go on from; None where the frame was never decided, or the run only localised.
+    """
+
+    truth: Truth | None = None
+    state: Saved | None = None
+
+    def errors(self) -> dict[str, Any]:
+        """Figures against the truth, as `evaluate` names them, with those of what was published at the time.
+
+        Raises:
+          UsageError: there is no truth.
+        """
+        if self.truth is None:
+            raise UsageError("no ground truth to compare with")
+        figures = evaluate(self, self.truth) | evaluation.consistency(self, self.truth)
+        online = evaluation.evaluate(self.stamps, self.online, {}, self.truth)
+        return figures | {"online_ate_m": online["robot_ate_m"]}
+
+    def save(self, folder: str | Path, title: str = "UWB and LiDAR SLAM") -> None:
+        """Writes every file of a run into a folder, which is created: see docs/formats.md. Raises OSError."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        figures = None if self.truth is None else self.errors()
+        write_report(self, folder / "report.html", figures, title)
+        self.summary |= figures or {}
+        write_result(self, folder)
+        if self.state is not None:
+            saved_state.save(self.state, folder)
+
+    def report(self, path: str | Path, title: str = "UWB and LiDAR SLAM") -> None:
+        """Writes the report, one HTML file that opens offline. Raises OSError."""
+        write_report(self, Path(path), None if self.truth is None else self.errors(), title)
+
+    def plot(self, axes: Any = None) -> Any:
+        """Draws map, track and beacons onto matplotlib axes, the current ones by default, and returns them.
+
+        Raises:
+          UsageError: matplotlib is not installed.
+        """
+        try:
+            from matplotlib import pyplot
+        except ImportError:
+            raise UsageError("plot needs matplotlib: pip install 'uwbslam_jax[plot]'") from None
+        from uwbslam_jax.plotting import show_run
+
+        axes = pyplot.gca() if axes is None else axes
+        show_run(axes, self)
+        return axes
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """A simulated recording: iterates over its messages, the same each time, one at a time.
+
+    Attributes:
+      scenario: what is simulated.
+    """
+
+    scenario: sim.Scenario
+
+    def __iter__(self) -> Iterator[Message]:
+        return sim.simulate(self.scenario)
+
+    @cached_property
+    def settings(self) -> Settings:
+        """What a user would configure for this robot: lever arms and heights, never what is to be found out."""
+        return settings_file.from_dict(sim.settings_overrides(self.scenario))
+
+    @cached_property
+    def truth(self) -> Truth:
+        """Where robot and beacons were."""
+        return Truth.from_messages(m for m in self if isinstance(m, TruthMessage))
+
+    def save(self, path: str | Path, progress: Callable[[int], object] | None = None) -> None:
+        """Writes the recording as MCAP. progress: called with the number of scans so far. Raises LogError."""
+        scans = 0
+        with LogWriter(path) as writer:
+            for message in self:
+                writer.write(message)
+                scans += isinstance(message, ScanMessage)
+                if progress is not None:
+                    progress(scans)
+
+
+Source = Paths | LogReader | Simulation | Iterable[Message]
+
+
+def simulate(name: str, seed: int = 0, duration: float | None = None, *, beams: int | None = None) -> Simulation:
+    """A ready-made scenario, see `SCENARIOS`.
+
+    Args:
+      seed: another seed is another world. duration: [s], the scenario's own where not given.
+      beams: of a scan, in place of the scenario's.
+
+    Raises:
+      UsageError: there is no such scenario, or a number is out of range.
+    """
+    if name not in sim.SCENARIOS:
+        raise UsageError(f"no scenario {name}; there are {', '.join(sim.SCENARIOS)}")
+    if seed < 0:
+        raise UsageError(f"seed {seed}: must not be negative")
+    if duration is not None and not 0.0 < duration < 1e6:
+        raise UsageError(f"duration {duration:g} s: must be greater than 0")
+    if beams is not None and beams < 2:
+        raise UsageError(f"beams {beams}: must be 2 at least")
+    made = sim.make_scenario(name, seed, duration)
+    if beams is not None:
+        made = dataclasses.replace(made, lidar=dataclasses.replace(made.lidar, beams=beams))
+    return Simulation(made)
+
+
+def read(path: Paths, settings: Settings | None = None) -> LogReader:
+    """Opens a recording: an iterable of messages, with its topics, warnings and truth. Raises LogError."""
+    s = settings or Settings()
+    return LogReader(
+        path,
+        scan_topic=s.lidar.topic,
+        uwb_topic=None if s.filter.lidar_only else s.uwb.topic,
+        odom_topic=s.odom.topic if s.odom.use else None,
+        robot_id=s.robot.id,
+        max_range=s.uwb.max_range,
+    )
+
+
+def inspect(path: Paths, settings: Settings | None = None) -> LogSummary:
+    """Tells what a recording holds: topics, rates, gaps, nodes heard, what is missing; `print` it. Raises LogError."""
+    s = settings or Settings()
+    topics = {"scan_topic": s.lidar.topic, "uwb_topic": s.uwb.topic, "odom_topic": s.odom.topic}
+    return inspect_log(path, **topics, robot_id=s.robot.id, max_range=s.uwb.max_range)
+
+
+def run(
     source: Source,
-    settings: Settings,
+    settings: Settings | None = None,
     *,
     online: bool = False,
-    progress: Callable[[int, int], object] | None = None,
-) -> tuple[Result, Truth | None]:
+    resume: str | Path | None = None,
+    localize: str | Path | None = None,
+    progress: Progress | None = None,
+) -> Result:
     """Runs a recording.
 
     Args:
-      source: an MCAP file, a ROS 2 bag folder, or several that belong together.
+      source: path of a recording, what `read` or `simulate` gave, or messages.
+      settings: the defaults where not given; a simulation brings its own.
       online: step frame by frame, as on the robot; the result is the same.
-      progress: called now and then with the number of messages read and of all.
-
-    Returns:
-      What the estimator found, and the ground truth where the recording has some.
+      resume: folder of a run to go on from, with its map and beacons.
+      localize: the same, but both stay as they are.
 
     Raises:
       LogError: the recording cannot be read, or holds no usable scan, no odometry and no ranges between nodes at
         rest that fix a geometry.
+      ConfigError: a setting is out of range. RunError: the folder to go on from holds no state that fits.
+      UsageError: both resume and localize.
     """
     begin = time.perf_counter()
-    reader = LogReader(
-        source,
-        scan_topic=settings.lidar.topic,
-        uwb_topic=None if settings.filter.lidar_only else settings.uwb.topic,
-        odom_topic=settings.odom.topic if settings.odom.use else None,
-        robot_id=settings.robot.id,
-        max_range=settings.uwb.max_range,
-    )
-    if "uwb" not in reader.topics.values():
+    messages, settings = _opened(source, settings)
+    reader = messages if isinstance(messages, LogReader) else None
+    if reader is not None and "uwb" not in reader.topics.values():
         settings = dataclasses.replace(settings, filter=dataclasses.replace(settings.filter, lidar_only=True))
-    settings = fit_beams(settings, reader)
+    settings = fit_beams(settings, messages)
+    saved, fixed = _saved(resume, localize, settings)
+    total = reader.message_count if reader is not None else 0
     with CompileClock() as clock:
-        runner = Runner(settings, clock, online=online)
-        for count, message in enumerate(reader):
+        runner = Runner(settings, clock, online=online, saved=saved, fixed=fixed)
+        for count, message in enumerate(messages):
             runner.add(message)
             if progress is not None and count % _PROGRESS_EVERY == 0:
-                progress(count, reader.message_count)
+                progress(count, total)
         runner.finish()
-        facts = Facts(list(reader.warnings), reader.dropped, reader.truncated, compile_s=clock.seconds)
-        facts.wall_s = time.perf_counter() - begin
-    result = runner.result(facts)
-    if not len(result.stamps) and not result.beacons:
+        facts = Facts(compile_s=clock.seconds)
+    if reader is not None:
+        facts.warnings, facts.dropped, facts.truncated = list(reader.warnings), reader.dropped, reader.truncated
+    facts.wall_s = time.perf_counter() - begin
+    found = finished(runner, facts)
+    if reader is not None and not len(found.stamps) and not found.beacons:
         why = f"; {reader.truncated}" if reader.truncated else ""
         raise LogError(
             f"{reader.name}: no usable scan on {settings.lidar.topic}, no odometry on {settings.odom.topic}, and no "
             f"ranges that fix a geometry on {settings.uwb.topic}{why}"
         )
     if progress is not None:
-        progress(reader.message_count, reader.message_count)
-    return result, runner.truth()
+        progress(total, total)
+    return found
 
 
-def run_messages(
-    messages: Iterable[Message], settings: Settings, *, online: bool = False
-) -> tuple[Result, Truth | None]:
-    """The same for messages in memory, as a recorder got them; iterated twice."""
-    begin = time.perf_counter()
-    settings = fit_beams(settings, messages)
-    with CompileClock() as clock:
-        runner = Runner(settings, clock, online=online)
-        for message in messages:
-            runner.add(message)
-        runner.finish()
-        facts = Facts(compile_s=clock.seconds, wall_s=time.perf_counter() - begin)
-    return runner.result(facts), runner.truth()
+class Slam:
+    """A run fed message by message, as on a robot. The same messages give the bits of `run`.
+
+    Attributes:
+      settings: what it runs with.
+    """
+
+    def __init__(
+        self,
+        settings: Settings | None = None,
+        *,
+        resume: str | Path | None = None,
+        localize: str | Path | None = None,
+        on_update: Callable[[Update], object] | None = None,
+        fit: bool = True,
+    ):
+        """Nothing is compiled yet: that happens with the first frame, or has been done by an earlier run.
+
+        Args:
+          resume, localize: see `run`.
+          on_update: called with each update before the host looks at what it means for beacons and map, which takes
+            longer now and then.
+          fit: make room for as many beams as the first scans have, by holding the first second of messages. Without, for
+            lidar.max_beams, at once.
+
+        Raises:
+          ConfigError, RunError, UsageError: see `run`.
+        """
+        self.settings = settings_file.check(settings or Settings())
+        self._goes_on = _saved(resume, localize, self.settings)
+        self._on_update = on_update
+        self._held: list[Message] = []
+        self._clock, self._begin = CompileClock(), time.perf_counter()
+        self._runner = None if fit else self._start()
+
+    def _start(self) -> Runner:
+        saved, fixed = self._goes_on
+        runner = Runner(self.settings, self._clock, online=True, saved=saved, fixed=fixed)
+        runner.session.listener = self._on_update
+        return runner
+
+    def add(self, message: Message) -> list[Update]:
+        """Takes in one measurement, in the order in which they arrive; what it led to, mostly nothing or one update."""
+        if self._runner is None:
+            self._held.append(message)
+            scans = sum(isinstance(m, ScanMessage) for m in self._held)
+            late = message.stamp - self._held[0].stamp > _PEEK_S * 1e9
+            return self._release() if scans >= PEEK_SCANS or late else []
+        with self._clock:
+            return self._runner.add(message)
+
+    def _release(self) -> list[Update]:
+        """What was held goes in."""
+        self.settings = fit_beams(self.settings, self._held)
+        self._runner, held, self._held = self._start(), self._held, []
+        return list(itertools.chain.from_iterable(map(self.add, held)))
+
+    @property
+    def runner(self) -> Runner:
+        """What does the work."""
+        if self._runner is None:
+            self._release()
+        assert self._runner is not None
+        return self._runner
+
+    @property
+    def status(self) -> RunStatus:
+        """Of start-up: what it waits for, or that the frame is decided."""
+        return self.runner.session.status if self._runner is not None else RunStatus.WAITING
+
+    def map(self) -> MapImage:
+        """The map so far."""
+        session = self.runner.session
+        return session.tiles.image(session.state.grid)
+
+    def finish(self, facts: Facts | None = None) -> Result:
+        """Ends the run: what still waits is stepped, and the whole run solved once more. facts: told besides."""
+        with self._clock:
+            self.runner.finish()
+        facts = facts or Facts()
+        facts.compile_s = self._clock.seconds
+        facts.wall_s = facts.wall_s or time.perf_counter() - self._begin
+        return finished(self.runner, facts)
+
+    def save(self, folder: str | Path) -> bool:
+        """Writes the state, for `resume` and `localize`, into a folder, which is created; False where there is none to
+        save, because the frame is not decided or the run only localises. Raises OSError."""
+        saved = self.runner.saved()
+        if saved is not None:
+            Path(folder).mkdir(parents=True, exist_ok=True)
+            saved_state.save(saved, Path(folder))
+        return saved is not None
+
+
+def finished(runner: Runner, facts: Facts) -> Result:
+    """The Result of a run that has ended, or so far."""
+    found = runner.result(facts)
+    values = {f.name: getattr(found, f.name) for f in dataclasses.fields(found)}
+    return Result(**values, truth=runner.truth(), state=runner.saved())
+
+
+def evaluate(estimate: Result | str | Path, truth: Truth | str | Path) -> dict[str, Any]:
+    """How far an estimate is from the truth, after one rigid motion that lays robot and beacons together over it.
+
+    Args:
+      estimate: a Result, or the folder of a run.
+      truth: or the path of a recording with ground truth, or of its arrays t, robot, ids, beacons (.npz).
+
+    Returns:
+      Name -> figure: robot_rmse_m, robot_ate_m, robot_max_m, heading_deg_median, beacon_mean_m ...
+
+    Raises:
+      RunError, LogError, UsageError: a file that cannot be used.
+    """
+    truth = truth if isinstance(truth, Truth) else load_truth(Path(truth))
+    if isinstance(estimate, data.Result):
+        beacons = {beacon.id: beacon.position for beacon in estimate.beacons}
+    else:
+        estimate = read_run(estimate)
+        beacons = dict(zip(estimate.beacon_ids.tolist(), estimate.beacons, strict=True))
+    return evaluation.evaluate(estimate.stamps, estimate.poses, beacons, truth)
+
+
+def load_truth(path: Path) -> Truth:
+    """Ground truth of a recording or of an .npz file. Raises LogError, UsageError."""
+    try:
+        if path.suffix == ".npz":
+            return Truth.load(path)
+        truth = LogReader(path, scan_topic=None, uwb_topic=None, odom_topic=None).truth
+    except LogError:
+        raise
+    except (ValueError, zipfile.BadZipFile) as error:
+        raise UsageError(str(error) if str(path) in str(error) else f"{path}: {error}") from None
+    if truth is None:
+        raise UsageError(f"{path}: has no ground truth of the robot")
+    return truth
+
+
+def tune(
+    recordings: Source | Sequence[Source],
+    params: Sequence[str] = (),
+    settings: Settings | None = None,
+    *,
+    objective: Literal["likelihood", "truth"] = "likelihood",
+    progress: Callable[[str], object] = lambda text: None,
+) -> Tuned:
+    """Finds noise parameters, range biases and the LiDAR's mounting.
+
+    Args:
+      recordings: one, or several to be explained together.
+      params: sigma_n, sigma_w, sigma_w_yaw, sigma_w_beacon, sigma_l, sigma_map, gamma ..., bias.ID, lidar.x, lidar.y,
+        lidar.yaw; by default sigma_n and sigma_l.
+      objective: what noises are tuned for, the likelihood of ranges and matches or the track's error.
+      progress: told what is being done.
+
+    Raises:
+      ConfigError: a name is unknown or a setting out of range. LogError: see `run`. RolloutError: start-up decides
+        nothing, too few frames follow, or there is no truth to tune for.
+    """
+    many = isinstance(recordings, Sequence) and not isinstance(recordings, str) and not _are_messages(recordings)
+    logs = []
+    for source in recordings if many else [recordings]:
+        messages, settings = _opened(source, settings)
+        name = messages.name if isinstance(messages, LogReader) else f"recording {len(logs) + 1}"
+        kept = list(messages)
+        truths = [m for m in kept if isinstance(m, TruthMessage)]
+        known = any(m.node is None for m in truths)
+        logs.append(tuning.Log(name, kept, Truth.from_messages(truths) if known else None))
+    return tuning.tune(logs, tuple(params), settings_file.check(settings or Settings()), objective, progress)
+
+
+def rollout(source: Source, settings: Settings | None = None) -> Rollout:
+    """A recording from the end of its start-up on, as one differentiable function of the parameters: `loss(params)`.
+
+    Raises:
+      LogError: see `run`. RolloutError: start-up decides nothing, or too few frames follow.
+    """
+    messages, settings = _opened(source, settings)
+    return tuning.prepare(list(messages), settings)
+
+
+def _are_messages(source: object) -> bool:
+    return isinstance(source, Sequence) and len(source) > 0 and isinstance(source[0], Message)
+
+
+def _opened(source: Source, settings: Settings | None) -> tuple[LogReader | Iterable[Message], Settings]:
+    """Messages that can be iterated over again, and the settings for them."""
+    if settings is None:
+        settings = source.settings if isinstance(source, Simulation) else Settings()
+    settings_file.check(settings)
+    if isinstance(source, LogReader | Simulation) or _are_messages(source):
+        return source, settings
+    if isinstance(source, str | Path | Sequence):
+        return read(source, settings), settings
+    return list(source), settings
+
+
+def _saved(resume: str | Path | None, localize: str | Path | None, settings: Settings) -> tuple[Saved | None, bool]:
+    """The state to go on from, and whether it stays as it is."""
+    if resume is not None and localize is not None:
+        raise UsageError("resume and localize: one of them")
+    folder = resume if localize is None else localize
+    return None if folder is None else saved_state.load(Path(folder), settings), localize is not None

@@ -48,7 +48,7 @@ def measure(*, quick: bool) -> Report:
 
 
 def recovery(quick: bool) -> Iterator[Metric]:
-    """Tuned sigma_n over the truth."""
+    """NoiseFit sigma_n over the truth."""
     from uwbslam_jax.tuning.fit import fit
     from uwbslam_jax.tuning.likelihood import Objective, piece
     from uwbslam_jax.tuning.rollout import prepare

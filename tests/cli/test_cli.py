@@ -238,7 +238,7 @@ def test_tune_writes_settings_that_run_takes(log: Path, tmp_path: Path, capsys: 
     ]
     assert main(words) == 0
     told = capsys.readouterr().out
-    settings = settings_file.load(tmp_path / "tuned.toml")
+    settings = settings_file.load_settings(tmp_path / "tuned.toml")
     assert settings.map.size_m == 25.6
     assert abs(settings.uwb.bias["7"]) < 0.1  # there is none
     assert settings.robot.lidar == (0.0, 0.0, 0.0)
@@ -260,7 +260,7 @@ class TestSimulate:
         path = tmp_path / "made.mcap"
         assert main(["simulate", "lever_arms", "--seed", "3", "--duration", "1", "-o", str(path), "--quiet"]) == 0
         made = make_scenario("lever_arms", 3, 1.0)
-        assert settings_file.load(path.with_suffix(".toml")) == settings_file.from_dict(settings_overrides(made))
+        assert settings_file.load_settings(path.with_suffix(".toml")) == settings_file.from_dict(settings_overrides(made))
         assert sum(isinstance(m, ScanMessage) for m in LogReader(path)) == 10
 
     def test_defaults_need_none(self, tmp_path: Path) -> None:

@@ -276,7 +276,7 @@ class TestBrokenFiles:
             assert (reader.message_count, reader.duration) == (one.message_count, one.duration)
             assert reader.truncated is None
         assert LogReader(files).name == f"{files[0]} and 1 more"
-        told, whole = log_summary.inspect(split), log_summary.inspect(split / "whole")
+        told, whole = log_summary.inspect_log(split), log_summary.inspect_log(split / "whole")
         assert [(t.name, t.role, t.count) for t in told.topics] == [(t.name, t.role, t.count) for t in whole.topics]
 
     def test_a_bag_whose_first_file_breaks_goes_on_with_the_second(self, split: Path) -> None:
@@ -410,7 +410,7 @@ class TestBrokenFiles:
             for at in rng.integers(8, len(whole), rng.integers(1, 8)):
                 content[at] = rng.integers(256)
             path.write_bytes(content)
-            for read in (lambda: list(LogReader(path)), lambda: log_summary.format_summary(log_summary.inspect(path))):
+            for read in (lambda: list(LogReader(path)), lambda: str(log_summary.inspect_log(path))):
                 try:
                     read()
                 except LogError as error:
@@ -738,7 +738,7 @@ class TestInspect:
     def test_summary(self, tmp_path: Path) -> None:
         truth: list[Message] = [TruthMessage(T0, None, 0.0, 0.0, 0.0)]
         path = write_log(tmp_path / "a.mcap", [*truth, *log_messages(31), RangeMessage(T0 + 4000 * MS, 0, 1, -1.0)])
-        summary = log_summary.inspect(path)
+        summary = log_summary.inspect_log(path)
         assert summary.ids == {0: 31, 1: 62, 2: 31}
         assert summary.pairs == {(0, 1): 31, (1, 2): 31}
         assert summary.duration == pytest.approx(4.0)
@@ -749,18 +749,18 @@ class TestInspect:
         assert (scans.role, scans.count) == ("scan", 31)
         assert scans.rate == pytest.approx(10.0)
         assert scans.largest_gap == pytest.approx(0.1)
-        text = log_summary.format_summary(summary)
+        text = str(summary)
         for part in ("/scan", "sensor_msgs/msg/LaserScan", "10.00", "0-1 (31)", "2 of 3", "powers: reported"):
             assert part in text
 
     def test_what_cannot_run_can_be_inspected(self, tmp_path: Path) -> None:
         path = write_log(tmp_path / "a.mcap", [RangeMessage(T0, 0, 1, 1.0)])
         path.write_bytes(path.read_bytes()[:-3])
-        summary = log_summary.inspect(path)
+        summary = log_summary.inspect_log(path)
         assert summary.problems == ["no scan topic"]
         assert summary.truncated is not None
         assert summary.powers is False
-        text = log_summary.format_summary(summary)
+        text = str(summary)
         assert "problem: no scan topic" in text
         assert "truncated: recording breaks" in text
         assert math.isnan(summary.topics[0].rate)

@@ -124,9 +124,9 @@ def _settings_file(words: Sequence[str]) -> Settings:
     """The settings of the file given by --config: they are the defaults that the flags are read against."""
     for k, word in enumerate(words):
         if word == "--config" and k + 1 < len(words):
-            return settings_file.load(words[k + 1])
+            return settings_file.load_settings(words[k + 1])
         if word.startswith("--config="):
-            return settings_file.load(word.removeprefix("--config="))
+            return settings_file.load_settings(word.removeprefix("--config="))
     return Settings()
 
 
@@ -172,7 +172,7 @@ def evaluate_run(options: EvaluateOptions) -> None:
 
 def inspect_log(options: InspectOptions) -> None:
     """The command `inspect`."""
-    s = settings_file.load(options.config) if options.config else Settings()
+    s = settings_file.load_settings(options.config) if options.config else Settings()
     topics = {"scan_topic": s.lidar.topic, "uwb_topic": s.uwb.topic, "odom_topic": s.odom.topic}
     print(format_summary(inspect(options.logs, **topics, robot_id=s.robot.id, max_range=s.uwb.max_range)))
 

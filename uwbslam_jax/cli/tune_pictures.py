@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from uwbslam_jax.tuning import Objective, Tuned
+from uwbslam_jax.tuning import NoiseFit, Objective
 
 _POINTS = 9
 _SIDE = 7
@@ -24,7 +24,7 @@ _WORST = 60.0
 """Log-likelihood below the best beyond which a slice has one colour."""
 
 
-def draw(objective: Objective, tuned: Tuned, folder: Path) -> list[Path]:
+def draw(objective: Objective, tuned: NoiseFit, folder: Path) -> list[Path]:
     """Writes the pictures into a folder; none without matplotlib."""
     try:
         import matplotlib
@@ -48,7 +48,7 @@ def _save(figure: Any, path: Path) -> Path:
     return path
 
 
-def _history(plt: Any, tuned: Tuned) -> Any:
+def _history(plt: Any, tuned: NoiseFit) -> Any:
     figure, axes = plt.subplots(figsize=(6, 4))
     fitted, held = np.array(tuned.history).reshape(-1, 2).T
     steps = np.arange(len(fitted))
@@ -61,7 +61,7 @@ def _history(plt: Any, tuned: Tuned) -> Any:
     return figure
 
 
-def profile(objective: Objective, tuned: Tuned, k: int) -> tuple[np.ndarray, np.ndarray]:
+def profile(objective: Objective, tuned: NoiseFit, k: int) -> tuple[np.ndarray, np.ndarray]:
     """Values (n,) of a parameter and by how much each is less likely than the best of them (n,). The others follow as
     the Hessian says that they would."""
     logs = np.log(tuned.values)
@@ -78,12 +78,12 @@ def profile(objective: Objective, tuned: Tuned, k: int) -> tuple[np.ndarray, np.
     return np.exp(logs[k] + steps), losses - losses.min()
 
 
-def _reach(tuned: Tuned, k: int) -> float:
+def _reach(tuned: NoiseFit, k: int) -> float:
     spread = _SPREADS * float(tuned.sigma[k]) if np.isfinite(tuned.sigma[k]) else _REACH[1]
     return float(np.clip(spread, *_REACH))
 
 
-def _profiles(plt: Any, objective: Objective, tuned: Tuned, told: list[int]) -> Any:
+def _profiles(plt: Any, objective: Objective, tuned: NoiseFit, told: list[int]) -> Any:
     figure, every = plt.subplots(1, len(told), figsize=(3.4 * len(told), 3.2), squeeze=False)
     for axes, k in zip(every[0], told, strict=True):
         values, worse = profile(objective, tuned, k)
@@ -98,7 +98,7 @@ def _profiles(plt: Any, objective: Objective, tuned: Tuned, told: list[int]) -> 
     return figure
 
 
-def _slice(plt: Any, objective: Objective, tuned: Tuned, told: list[int]) -> Any:
+def _slice(plt: Any, objective: Objective, tuned: NoiseFit, told: list[int]) -> Any:
     first, second = told[:2]
     if all(name in tuned.names for name in _SLICED):
         first, second = (tuned.names.index(name) for name in _SLICED)

@@ -64,8 +64,33 @@ class LogSummary:
     problems: list[str]
     truncated: str | None
 
+    def __str__(self) -> str:
+        """Text of several lines, units in the column heads."""
+        lines = [f"{self.name}: {self.duration:.1f} s"]
+        rows = [("topic", "role", "messages", "rate [Hz]", "largest gap [s]", "type")]
+        for topic in self.topics:
+            rate, gap = ("-" if math.isnan(v) else f"{v:.2f}" for v in (topic.rate, topic.largest_gap))
+            rows.append((topic.name, topic.role or "-", str(topic.count), rate, gap, topic.schema))
+        widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+        for row in rows:
+            cells = [c.rjust(w) if 2 <= k <= 4 else c.ljust(w) for k, (c, w) in enumerate(zip(row, widths, strict=True))]
+            lines.append("  " + "  ".join(cells).rstrip())
+        if self.beams:
+            lines.append(f"beams a scan: {self.beams}")
+        if self.pairs:
+            lines.append("nodes heard: " + ", ".join(f"{node} ({count})" for node, count in self.ids.items()))
+            nodes = len(self.ids)
+            lines.append(f"pairs heard: {len(self.pairs)} of {nodes * (nodes - 1) // 2}: " + _pairs(self.pairs))
+            lines.append(f"powers: {'reported' if self.powers else 'not reported: NLOS by residuals only'}")
+        lines.append(f"odometry: {'yes' if self.odometry else 'no'}")
+        lines.append(f"ground truth: {'yes' if self.ground_truth else 'no'}")
+        lines += [f"dropped: {count} x {reason}" for reason, count in sorted(self.dropped.items())]
+        lines += [f"problem: {problem}" for problem in self.problems]
+        lines += [f"truncated: {self.truncated}"] if self.truncated else []
+        return "\n".join(lines)
 
-def inspect(
+
+def inspect_log(
     source: Source,
     *,
     scan_topic: str | None = "/scan",
@@ -161,32 +186,6 @@ def _topics(recording: Bag, clocks: dict[str, _Clock], roles: dict[int, Role]) -
         gap = clock.gap * 1e-9 if clock.count > 1 else math.nan
         summaries.append(TopicSummary(name, by_name[name].schema, role_of.get(name), clock.count, rate, gap))
     return summaries
-
-
-def format_summary(summary: LogSummary) -> str:
-    """The summary as text of several lines, units in the column heads."""
-    lines = [f"{summary.name}: {summary.duration:.1f} s"]
-    rows = [("topic", "role", "messages", "rate [Hz]", "largest gap [s]", "type")]
-    for topic in summary.topics:
-        rate, gap = ("-" if math.isnan(v) else f"{v:.2f}" for v in (topic.rate, topic.largest_gap))
-        rows.append((topic.name, topic.role or "-", str(topic.count), rate, gap, topic.schema))
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    for row in rows:
-        cells = [c.rjust(w) if 2 <= k <= 4 else c.ljust(w) for k, (c, w) in enumerate(zip(row, widths, strict=True))]
-        lines.append("  " + "  ".join(cells).rstrip())
-    if summary.beams:
-        lines.append(f"beams a scan: {summary.beams}")
-    if summary.pairs:
-        lines.append("nodes heard: " + ", ".join(f"{node} ({count})" for node, count in summary.ids.items()))
-        nodes = len(summary.ids)
-        lines.append(f"pairs heard: {len(summary.pairs)} of {nodes * (nodes - 1) // 2}: " + _pairs(summary.pairs))
-        lines.append(f"powers: {'reported' if summary.powers else 'not reported: NLOS by residuals only'}")
-    lines.append(f"odometry: {'yes' if summary.odometry else 'no'}")
-    lines.append(f"ground truth: {'yes' if summary.ground_truth else 'no'}")
-    lines += [f"dropped: {count} x {reason}" for reason, count in sorted(summary.dropped.items())]
-    lines += [f"problem: {problem}" for problem in summary.problems]
-    lines += [f"truncated: {summary.truncated}"] if summary.truncated else []
-    return "\n".join(lines)
 
 
 def _pairs(pairs: dict[tuple[int, int], int], most: int = 28) -> str:

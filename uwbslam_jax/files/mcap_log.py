@@ -9,10 +9,12 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Iterator
+from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 
 from uwbslam_jax.errors import LogError as LogError
+from uwbslam_jax.evaluation import Truth
 from uwbslam_jax.files.bag import Bag, Source
 from uwbslam_jax.files.mcap_container import Channel, RecordWriter
 from uwbslam_jax.files.ros_types import definition, encode
@@ -87,6 +89,14 @@ class LogReader:
     @property
     def truncated(self) -> str | None:
         return self._recording.truncated
+
+    @cached_property
+    def truth(self) -> Truth | None:
+        """Where robot and beacons were, None where the recording has no truth of the robot; read through for it."""
+        wanted = {number: decode for number, decode in self._decoders.items() if self._roles[number] == "truth"}
+        truths = [m for at, n, raw in self._recording.records(set(wanted)) for m in wanted[n](raw, at)]
+        told = [m for m in truths if isinstance(m, TruthMessage)]
+        return Truth.from_messages(told) if any(m.node is None for m in told) else None
 
     def __iter__(self) -> Iterator[Message]:
         self._options.dropped.clear()

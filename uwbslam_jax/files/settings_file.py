@@ -40,7 +40,7 @@ _LIMITS = {
 }
 
 
-def load(path: Path | str) -> Settings:
+def load_settings(path: Path | str) -> Settings:
     """Settings from a TOML file; what the file leaves out keeps its default.
 
     Raises:
@@ -79,7 +79,7 @@ def from_dict(table: Mapping[str, Any]) -> Settings:
 
 
 def dump(settings: Settings) -> str:
-    """TOML text of all settings; `load` reads it back to equal settings."""
+    """TOML text of all settings; `load_settings` reads it back to equal settings."""
     blocks = []
     for section in dataclasses.fields(settings):
         values = getattr(settings, section.name)
@@ -97,6 +97,11 @@ def differences(settings: Settings) -> str:
         if changed := [line for line in lines if line not in usual[head]]:
             blocks.append("\n".join([head, *changed]) + "\n")
     return "\n".join(blocks)
+
+
+def save_settings(settings: Settings, path: Path | str) -> None:
+    """Writes what differs from the defaults as TOML; `load_settings` reads it back to equal settings. Raises OSError."""
+    Path(path).write_text(differences(settings), encoding="utf-8")
 
 
 def _blocks(text: str) -> Iterator[tuple[str, list[str]]]:

@@ -42,7 +42,7 @@ _BISECTIONS = 6
 
 
 @dataclass(frozen=True)
-class Tuned:
+class NoiseFit:
     """What was found, p parameters.
 
     Attributes:
@@ -76,7 +76,7 @@ class Tuned:
         return float(self.values[k]) / spread, float(self.values[k]) * spread
 
 
-def fit(objective: Objective, progress: Progress = lambda text: None) -> Tuned:
+def fit(objective: Objective, progress: Progress = lambda text: None) -> NoiseFit:
     """Minimises an objective from its start. progress: told a line at every step."""
     start = objective.start
     told = dict.fromkeys(objective.names, "")
@@ -95,7 +95,7 @@ def fit(objective: Objective, progress: Progress = lambda text: None) -> Tuned:
         objective.free[hidden] = False
         logs, stopped = _descend(objective, logs, history, progress)
     logs = _polished(objective, logs, np.diag(hessian))
-    return Tuned(
+    return NoiseFit(
         objective.names,
         np.exp(start),
         np.exp(logs),

@@ -80,6 +80,11 @@ class Rollout(NamedTuple):
         """From its first frame to its last [s]."""
         return float(self.stamps[-1] - self.stamps[0]) / 1e9
 
+    def loss(self, params: Params) -> Float[Array, ""]:
+        """Negative log-likelihood of the ranges and matches, a measurement; differentiable, with the estimator's decisions
+        held. params: see `Params`; those of the rollout where nothing is to be changed."""
+        return _loss(self.config, params, self.params, self.state, self.frames)
+
 
 def prepare(messages: Sequence[Message], settings: Settings) -> Rollout:
     """Runs start-up on a recording and keeps what follows.
@@ -173,6 +178,13 @@ def stacked(frames: Sequence[StampedFrame]) -> Frame:
 def losses(config: Config, params: Params, state: State, frames: Frame) -> Losses:
     """Every frame's losses, forward only."""
     return lax.scan(partial(_step, config, params), rescaled(params, params, state), frames)[1]
+
+
+@partial(jax.jit, static_argnums=0)
+def _loss(config: Config, params: Params, before: Params, state: State, frames: Frame) -> Float[Array, ""]:
+    told = checkpointed(config, params, rescaled(params, before, state), frames)
+    count = jnp.sum(told.counts) + jnp.sum(frames.has_scan[: told.counts.shape[0]])
+    return (jnp.sum(told.ranges) + jnp.sum(told.matches)) / count
 
 
 def rescaled(params: Params, before: Params, state: State) -> State:
