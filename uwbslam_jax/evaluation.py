@@ -1,4 +1,4 @@
-"""How good an estimate is against the truth: ATE, RPE, heading and beacon errors, NEES. Host arrays only.
+"""How good an estimate is against the truth: ATE, heading and beacon errors, NEES. Host arrays only.
 
 An estimate is in a frame of its own, so it is laid over the truth by a rigid motion first. Never by a reflection: a
 mirrored answer is a wrong answer.
@@ -243,38 +243,6 @@ def absolute_trajectory_error(estimated: Float[np.ndarray, "n 2"], true: Float[n
     """ATE: root mean square distance after the best rigid motion of the track alone [m]."""
     off = rigid_fit(estimated, true).points(estimated) - true
     return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
-
-
-def relative_pose_error(
-    estimated: Float[np.ndarray, "n 3"], true: Float[np.ndarray, "n 3"], along: Float[np.ndarray, "n"], step: float
-) -> Float[np.ndarray, "m 2"]:
-    """RPE: error of the motion over a given stretch, for every pose that has one ahead of it. Needs no alignment.
-
-    Args:
-      estimated, true: poses at the same times [m, m, rad].
-      along: what a stretch is measured by, never decreasing: time [s], or `travelled(true)` [m].
-      step: length of a stretch, in the unit of `along`; each ends at the first pose at least that far on.
-
-    Returns:
-      Distance and angle of E^-1 T, with E and T the estimated and the true motion over the stretch [m, rad >= 0].
-    """
-    end = np.searchsorted(along, along + step)
-    start = np.flatnonzero(end < len(along))
-    end = end[start]
-    error = _between(_between(estimated[start], estimated[end]), _between(true[start], true[end]))
-    return np.column_stack([np.linalg.norm(error[:, :2], axis=1), np.abs(wrap(error[:, 2]))])
-
-
-def travelled(poses: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n"]:
-    """Length of the way to each pose from the first [m]."""
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1))])
-
-
-def _between(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Poses b as seen from poses a [m, m, rad]."""
-    c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
-    d = b - a
-    return np.column_stack([c * d[:, 0] + s * d[:, 1], c * d[:, 1] - s * d[:, 0], d[:, 2]])
 
 
 class Nees(NamedTuple):

@@ -4,12 +4,84 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from enum import Enum, StrEnum
 from typing import Any
 
 import numpy as np
 
 OCCUPIED_THRESHOLD = 0.65
 _OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205
+
+
+class RunStatus(StrEnum):
+    """How far start-up is; the value is what files and pages say."""
+
+    LIDAR_ONLY = "LiDAR only"
+    WAITING = "waiting for motion"
+    PLACING = "placing beacons"
+    UNDECIDED = "reflection undecided"
+    DECIDED = "decided"
+
+
+class BeaconStatus(StrEnum):
+    """What a beacon does, as the run has it.
+
+    WAITING: heard but not placed. RELATIVE: the robot has not moved, only the geometry among the nodes is known, in a
+    frame of its own.
+    """
+
+    STATIC = "static"
+    MOVING = "moving"
+    SILENT = "silent"
+    DROPPED = "dropped"
+    WAITING = "waiting"
+    RELATIVE = "relative"
+
+
+class EventKind(Enum):
+    """What happened in a run; the value is the sentence that tells it, {} stands for an event's detail."""
+
+    STATUS = "{}"
+    FRAME_DECIDED = "frame decided by beacons {}"
+    CORRECTED = "beacons and map corrected by the run so far"
+    BIASED = "ranges are biased: biases and beacons solved from the run so far"
+    LOCALISING = "localising in a saved map"
+    RESUMED = "going on from a saved run"
+    ROBOT_CARRIED = "robot was carried: found again by its ranges"
+    PLACED = "placed"
+    PLACED_MOVING = "placed while it is carried"
+    CARRIED = "is being carried"
+    PUT_DOWN = "was put down: rests at a new place"
+    MOVED = "was moved: rests at a new place"
+    LOST_MOVING = "was lost while carried"
+    SILENT_MOVING = "fell silent while it was carried"
+    SILENT = "fell silent"
+    HEARD_AGAIN = "is heard again"
+    DROPPED = "dropped: not heard for a minute"
+    DOUBTED = "ranges do not fit ({} m): a clock, walls, or it was moved"
+    FITS_AGAIN = "ranges fit again"
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something that happened in a run.
+
+    Attributes:
+      stamp: when [ns].
+      kind: what.
+      node: id of the beacon that it happened to, None where it is the robot or the run as a whole.
+      detail: what the kind leaves open.
+    """
+
+    stamp: int
+    kind: EventKind
+    node: int | None = None
+    detail: str = ""
+
+    @property
+    def text(self) -> str:
+        """The event as a sentence for people."""
+        return ("" if self.node is None else f"beacon {self.node} ") + self.kind.value.format(self.detail)
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,14 +92,13 @@ class BeaconEstimate:
       id: the node's id.
       position: (2,) [m].
       cov: (2, 2) [m^2].
-      status: "static", "moving", "silent" or "dropped"; "relative" while the robot has not moved and only the geometry
-        among the nodes is known, in a frame of its own.
+      status: see there.
     """
 
     id: int
     position: np.ndarray
     cov: np.ndarray
-    status: str
+    status: BeaconStatus
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +132,7 @@ class Result:
       range_residuals: (R, 4) of t [s since stamps[0]], node a, node b, measured minus predicted [m]; thinned.
       scan_points: last scan in the published frame (n, 2) [m].
       diagnostics: name -> (T,) array, one value a frame (match score, hypotheses, searches, ranges used ...).
-      events: (stamp ns, text) of start-up and beacon life.
+      events: of start-up and beacon life.
       summary: the content of summary.json (see DESIGN: steps, duration_s, ...), without evaluation figures.
     """
 
@@ -75,7 +146,7 @@ class Result:
     range_residuals: np.ndarray
     scan_points: np.ndarray
     diagnostics: dict[str, np.ndarray] = field(default_factory=dict)
-    events: list[tuple[int, str]] = field(default_factory=list)
+    events: list[Event] = field(default_factory=list)
     summary: dict[str, Any] = field(default_factory=dict)
 
 

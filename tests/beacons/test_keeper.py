@@ -13,6 +13,7 @@ from uwbslam_jax.beacons.keeper import BeaconKeeper
 from uwbslam_jax.estimator import init, state_vector
 from uwbslam_jax.estimator.state import Estimate, State
 from uwbslam_jax.measurements import Frame, StampedFrame
+from uwbslam_jax.result import EventKind
 from uwbslam_jax.session.frame_assembler import pad_scan
 from uwbslam_jax.settings import Params, Settings, UwbSettings, make_config, make_params
 
@@ -59,7 +60,7 @@ class World:
         self._pairs = pairs
         self.params = make_params(SETTINGS) if params is None else params
         self.positions = BEACONS.copy()
-        self.events: list[tuple[float, int, str]] = []
+        self.events: list[tuple[int, EventKind, str]] = []
         self.time = 0.0
         self.excess = np.zeros(4)
         self.carried = np.zeros(2)  # where the robot is minus where the estimate has it
@@ -112,7 +113,7 @@ class World:
 
     def _look(self, pending) -> None:
         self.state, events = self.keeper.look(self.state, self.params, pending)
-        self.events += [(self.time, slot, text) for slot, text in events]
+        self.events += events
 
     def position(self, slot: int) -> np.ndarray:
         return np.asarray(state_vector.unpack(self.state.belief.mean).positions[slot], float)
@@ -123,7 +124,7 @@ def test_a_beacon_that_joins_is_placed_where_it_stands_within_its_stated_covaria
     before = world.state
     world.run(12.0, (1, 2, 3))
     assert world.keeper.status(3) == "static"
-    assert [(slot, text) for _, slot, text in world.events] == [(3, "placed")]
+    assert world.events == [(3, EventKind.PLACED, "")]
     np.testing.assert_array_equal(world.state.active, True)
     P = np.asarray(world.state.belief.cov, float)
     error = world.position(3) - BEACONS[3]
@@ -187,7 +188,7 @@ def test_a_robot_that_was_carried_is_put_where_its_ranges_say_and_no_beacon_is_b
     assert world.events == []
     world.carried = np.array([0.0, -4.0])
     world.run(1.0, (1, 2, 3))
-    assert [(slot, text) for _, slot, text in world.events] == [(0, "was carried: found again by its ranges")]
+    assert world.events == [(0, EventKind.ROBOT_CARRIED, "")]
     place = np.asarray(world.state.belief.mean[:2], float)
     np.testing.assert_allclose(place, world.pose()[:2] + world.carried, atol=0.3)  # its own stated sigma
     np.testing.assert_array_equal(np.asarray(world.state.active), True)
@@ -202,7 +203,7 @@ def test_one_beacon_that_was_moved_does_not_carry_the_robot():
     world = World(known(1, 2, 3))
     world.excess[3] = 3.0
     world.run(3.0, (1, 2, 3))
-    assert all(slot == 3 for _, slot, _ in world.events)
+    assert all(slot == 3 for slot, _, _ in world.events)
 
 
 def test_a_silent_beacon_keeps_its_place_and_is_dropped_after_a_minute():
@@ -216,8 +217,8 @@ def test_a_silent_beacon_keeps_its_place_and_is_dropped_after_a_minute():
     world.run(4.0, (1, 2))
     assert world.keeper.status(3) == "dropped"
     np.testing.assert_array_equal(world.state.active, [True, True, True, False])
-    assert [text for _, slot, text in world.events if slot == 3] == ["fell silent", "dropped: not heard for a minute"]
-    assert {slot for _, slot, _ in world.events} == {3}
+    assert [kind for _, kind, _ in world.events] == [EventKind.SILENT, EventKind.DROPPED]
+    assert {slot for slot, _, _ in world.events} == {3}
 
 
 def test_a_silent_beacon_that_is_heard_again_is_static():
@@ -225,7 +226,7 @@ def test_a_silent_beacon_that_is_heard_again_is_static():
     world.run(6.0, (1, 2))
     world.run(2.0, (1, 2, 3))
     assert world.keeper.status(3) == "static"
-    assert [text for _, _, text in world.events] == ["fell silent", "is heard again"]
+    assert [kind for _, kind, _ in world.events] == [EventKind.SILENT, EventKind.HEARD_AGAIN]
 
 
 def test_a_dropped_beacon_comes_back_the_same_way_as_a_new_one():
@@ -245,7 +246,7 @@ def test_a_beacon_that_was_moved_is_placed_anew_when_the_robot_alone_hears_it():
     world.positions[3] = [2.0, 6.0]
     world.run(15.0, (1, 2, 3))
     assert world.keeper.status(3) == "static"
-    assert (3, "was moved: rests at a new place") in [(slot, text) for _, slot, text in world.events]
+    assert (3, EventKind.MOVED, "") in world.events
     error, cov = world.position(3) - [2.0, 6.0], np.asarray(world.state.belief.cov, float)[6:8, 6:8]
     assert error @ np.linalg.solve(cov, error) < 13.8  # chi-square of 2, 1 in 1000
     assert world.keeper.status(1) == world.keeper.status(2) == "static"
@@ -267,8 +268,8 @@ def test_a_beacon_is_followed_while_it_is_carried_and_rests_where_it_is_put_down
     assert world.keeper.status(3) == "static"
     assert not np.any(world.state.moving)
     np.testing.assert_allclose(world.position(3), world.positions[3], atol=0.1)
-    assert [text for _, _, text in world.events] == ["is being carried", "was put down: rests at a new place"]
-    assert {slot for _, slot, _ in world.events} == {3}
+    assert [kind for _, kind, _ in world.events] == [EventKind.CARRIED, EventKind.PUT_DOWN]
+    assert {slot for slot, _, _ in world.events} == {3}
 
 
 def test_a_beacon_that_joins_while_it_is_carried_is_placed_as_moving():
@@ -277,7 +278,7 @@ def test_a_beacon_that_joins_while_it_is_carried_is_placed_as_moving():
     world.run(2.0, (1, 2, 3))
     assert world.keeper.status(3) == "moving"
     np.testing.assert_allclose(world.position(3), world.positions[3], atol=0.5)
-    assert [text for _, _, text in world.events] == ["placed while it is carried"]
+    assert [kind for _, kind, _ in world.events] == [EventKind.PLACED_MOVING]
 
 
 def test_a_carried_beacon_that_falls_silent_leaves_the_state():
@@ -288,7 +289,7 @@ def test_a_carried_beacon_that_falls_silent_leaves_the_state():
     assert world.keeper.status(3) == "waiting"
     np.testing.assert_array_equal(world.state.active, [True, True, True, False])
     np.testing.assert_array_equal(world.state.moving, False)
-    assert world.events[-1][2] == "fell silent while it was carried"
+    assert world.events[-1][1] is EventKind.SILENT_MOVING
 
 
 def test_a_clock_that_drifts_is_told_of_and_nobody_is_thrown_out():
@@ -299,12 +300,13 @@ def test_a_clock_that_drifts_is_told_of_and_nobody_is_thrown_out():
         world.run(1.0, (1, 2, 3))
     assert [world.keeper.status(slot) for slot in (1, 2, 3)] == ["static"] * 3
     np.testing.assert_array_equal(np.asarray(world.state.active), True)
-    told = [text for _, slot, text in world.events if slot == 3]
+    told = [(kind, detail) for slot, kind, detail in world.events if slot == 3]
     assert len(told) == 1
-    assert told[0].startswith("ranges do not fit (+")
+    assert told[0][0] is EventKind.DOUBTED
+    assert told[0][1].startswith("+")
     world.excess[3] = 0.0
     world.run(3.0, (1, 2, 3))
-    assert world.events[-1][1:] == (3, "ranges fit again")
+    assert world.events[-1] == (3, EventKind.FITS_AGAIN, "")
 
 
 def test_a_few_wild_ranges_do_not_take_a_beacon_out():

@@ -260,7 +260,9 @@ class TestSimulate:
         path = tmp_path / "made.mcap"
         assert main(["simulate", "lever_arms", "--seed", "3", "--duration", "1", "-o", str(path), "--quiet"]) == 0
         made = make_scenario("lever_arms", 3, 1.0)
-        assert settings_file.load_settings(path.with_suffix(".toml")) == settings_file.from_dict(settings_overrides(made))
+        assert settings_file.load_settings(path.with_suffix(".toml")) == settings_file.from_dict(
+            settings_overrides(made)
+        )
         assert sum(isinstance(m, ScanMessage) for m in LogReader(path)) == 10
 
     def test_defaults_need_none(self, tmp_path: Path) -> None:

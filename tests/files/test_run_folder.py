@@ -14,7 +14,7 @@ from hypothesis import given, strategies as st
 
 from uwbslam_jax.errors import RunError
 from uwbslam_jax.files.run_folder import read_run, read_trajectory, write_result, write_trajectory
-from uwbslam_jax.result import BeaconEstimate, MapImage, Result, trinary
+from uwbslam_jax.result import BeaconEstimate, BeaconStatus, Event, EventKind, MapImage, Result, trinary
 
 T0 = 1_700_000_000_123_456_789  # ns; no float64 holds it
 FRAMES = 60
@@ -37,15 +37,15 @@ def make_result() -> Result:
         online=poses + 0.25,
         online_covs=covs,
         beacons=[
-            BeaconEstimate(4_000_000_000, np.array([5.0, 6.0]), np.diag([0.01, 0.04]), "silent"),
-            BeaconEstimate(1, np.array([1.0, 2.0]), np.diag([0.04, 0.01]), "static"),
+            BeaconEstimate(4_000_000_000, np.array([5.0, 6.0]), np.diag([0.01, 0.04]), BeaconStatus.SILENT),
+            BeaconEstimate(1, np.array([1.0, 2.0]), np.diag([0.04, 0.01]), BeaconStatus.STATIC),
         ],
         beacon_tracks={1: track, 4_000_000_000: track[6:]},
         map=MapImage(log_odds, 0.05, np.array([-1.0, -2.0])),
         range_residuals=np.zeros((0, 4)),
         scan_points=np.zeros((0, 2)),
         diagnostics={"score": np.linspace(0, 1, FRAMES), "hypotheses": np.ones(FRAMES, np.int64)},
-        events=[(T0, "waiting for motion")],
+        events=[Event(T0, EventKind.STATUS, detail="waiting for motion")],
         summary={
             "steps": np.int64(FRAMES),
             "step_ms_median": np.float32(1 / 3),
@@ -190,6 +190,7 @@ def test_an_empty_run(tmp_path: Path) -> None:
         ("beacons.csv", None, "No such file"),
         ("beacons.csv", "id,x\n1,2\n", "not a table of"),
         ("beacons.csv", "id,x,y,sigma_x,sigma_y,status\n1,2,three,4,5,static\n", "not a table of"),
+        ("beacons.csv", "id,x,y,sigma_x,sigma_y,status\n1,2,3,4,5,gone\n", "'gone' is not a valid BeaconStatus"),
         ("summary.json", "{", "summary.json"),
     ],
 )

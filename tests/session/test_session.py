@@ -13,6 +13,7 @@ import small_room as room
 from uwbslam_jax.estimator import compiled, init
 from uwbslam_jax.estimator.compiled import TRACES
 from uwbslam_jax.measurements import StampedFrame
+from uwbslam_jax.result import EventKind
 from uwbslam_jax.session.session import CONTROL_EVERY, Session
 from uwbslam_jax.settings import FilterSettings, LidarSettings, MapSettings, Settings, UwbSettings
 
@@ -125,6 +126,28 @@ def test_nothing_is_traced_again_while_beacons_join_fall_silent_and_drop(decided
         run.step(frame)
     assert warm["step"] >= 1
     assert dict(TRACES) == warm
+
+
+def test_a_beacon_that_is_only_doubted_keeps_its_place_in_the_graph():
+    run = Session(SETTINGS)
+    drive = Drive(run)
+    while run.decided_at is None and drive.time < 20.0:
+        run.steps(drive.frames(CONTROL_EVERY, (10, 20, 30)))
+    slot = run.slots[30]
+    place = run.graph.ranges.node(slot)
+    told = []
+    while not told and drive.time < 30.0:  # a metre too long, but not from one other place: a wall, or its clock
+        frames = drive.frames(CONTROL_EVERY, (10, 20, 30))
+        for r in (frame.frame.ranges for frame in frames):
+            r.range[(r.i == slot) | (r.j == slot)] += np.float32(1.0)
+        run.steps(frames)
+        told = [event for event in run.history.events if event.kind is EventKind.DOUBTED]
+    run.steps(drive.frames(CONTROL_EVERY, (10, 20, 30)))
+    assert [event.node for event in told] == [30]
+    assert told[0].text == f"beacon 30 ranges do not fit ({told[0].detail} m): a clock, walls, or it was moved"
+    assert run.graph.ranges.node(slot) == place
+    means = run.graph.ranges.means.values
+    assert set(means["place"][means["slot"] == slot].tolist()) == {place[1]}
 
 
 def test_online_and_batch_give_the_same_bits():

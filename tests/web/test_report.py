@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from uwbslam_jax.result import BeaconEstimate, MapImage, Result
+from uwbslam_jax.result import BeaconEstimate, BeaconStatus, Event, EventKind, MapImage, Result
 from uwbslam_jax.web.report import write_report
 
 START = 1_700_000_000_000_000_000
@@ -35,15 +35,18 @@ def make_result(frames: int = 200, **changes: Any) -> Result:
         "poses": np.column_stack([2 + np.cos(turn), 1.5 + np.sin(turn), turn + np.pi / 2]),
         "online_covs": np.broadcast_to(np.diag([0.01, 0.02, 0.001]) ** 2, (frames, 3, 3)),
         "beacons": [
-            BeaconEstimate(1, np.array([0.0123, 3.4567]), np.diag([0.0042, 0.0051]) ** 2, "static"),
-            BeaconEstimate(4294967295, np.array([3.9, 0.0]), np.diag([0.1, 0.1]), "silent"),
+            BeaconEstimate(1, np.array([0.0123, 3.4567]), np.diag([0.0042, 0.0051]) ** 2, BeaconStatus.STATIC),
+            BeaconEstimate(4294967295, np.array([3.9, 0.0]), np.diag([0.1, 0.1]), BeaconStatus.SILENT),
         ],
         "beacon_tracks": {1: np.array([[1.0, 0.0, 3.4, 0.1], [9.0, 0.012, 3.456, 0.01]])},
         "map": MapImage(log_odds, 0.05, np.array([-0.5, -0.5])),
         "range_residuals": residuals,
         "scan_points": rng.uniform(0, 3, (50, 2)),
         "diagnostics": {"match_score": rng.uniform(0.8, 1, frames), "hypotheses": np.ones(frames, int)},
-        "events": [(START, "waiting for motion"), (START + 3_210_000_000, "frame decided")],
+        "events": [
+            Event(START, EventKind.STATUS, detail="waiting for motion"),
+            Event(START + 3_210_000_000, EventKind.FRAME_DECIDED, detail="1 and 2"),
+        ],
         "summary": {
             "steps": frames,
             "duration_s": 19.9,
@@ -162,9 +165,11 @@ def test_the_map_is_upright_and_unknown_is_transparent(tmp_path: Path) -> None:
 
 def test_hostile_text_stays_text(tmp_path: Path) -> None:
     attack = "</script><script>alert(1)</script><img src=x onerror='alert(2)'>{{data}}\"&"
+    beacon = BeaconEstimate(1, np.zeros(2), np.eye(2), BeaconStatus.STATIC)
+    object.__setattr__(beacon, "status", attack)  # past its type: the page trusts no text
     result = make_result(
-        events=[(START, attack)],
-        beacons=[BeaconEstimate(1, np.zeros(2), np.eye(2), attack)],
+        events=[Event(START, EventKind.STATUS, detail=attack)],
+        beacons=[beacon],
         diagnostics={attack: np.ones(200)},
         summary={attack: attack, "dropped": {attack: 1}, "config": attack, "warnings": [attack], "truncated": attack},
     )
@@ -191,7 +196,7 @@ def test_nan_and_infinity_do_not_break_the_data(tmp_path: Path) -> None:
             range_residuals=residuals,
             map=MapImage(log_odds, 0.05, np.zeros(2)),
             online_covs=np.full((200, 3, 3), np.nan),
-            beacons=[BeaconEstimate(1, np.full(2, np.nan), np.full((2, 2), np.inf), "static")],
+            beacons=[BeaconEstimate(1, np.full(2, np.nan), np.full((2, 2), np.inf), BeaconStatus.STATIC)],
             diagnostics={"match_score": np.where(np.arange(200) % 2, np.nan, 0.5), "odd": np.full(200, np.nan)},
             summary={"real_time_factor": float("nan"), "wall_s": float("inf")},
         ),
@@ -252,7 +257,9 @@ def test_a_long_run_of_many_nodes_stays_small(tmp_path: Path) -> None:
     score[12_345] = 0.1
     result = make_result(
         frames,
-        beacons=[BeaconEstimate(k, rng.normal(size=2), np.eye(2) * 1e-4, "static") for k in range(1, beacons + 1)],
+        beacons=[
+            BeaconEstimate(k, rng.normal(size=2), np.eye(2) * 1e-4, BeaconStatus.STATIC) for k in range(1, beacons + 1)
+        ],
         beacon_tracks=dict.fromkeys(range(1, beacons + 1), path),
         map=MapImage(rng.choice([-1.0, 0.0, 2.0], (4000, 3000)).astype(np.float32), 0.05, np.zeros(2)),
         range_residuals=np.column_stack([np.linspace(0, 150, 200_000), pairs, rng.normal(0, 0.1, 200_000)]),

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import statistics
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,6 +32,7 @@ from uwbslam_jax.beacons.range_table import Heard, heard
 from uwbslam_jax.estimator import Estimate, State, ranging
 from uwbslam_jax.measurements import StampedFrame
 from uwbslam_jax.numerics import locate
+from uwbslam_jax.result import BeaconStatus, EventKind
 from uwbslam_jax.settings import Params, Settings
 
 _SILENT_S = 3.0
@@ -59,9 +61,15 @@ but not from one other place for long."""
 _NEWEST = 4
 """So many of a beacon's newest ranges place a robot that was carried."""
 
-_WATCHED = ("static", "moving", "silent")
+_WATCHED = (BeaconStatus.STATIC, BeaconStatus.MOVING, BeaconStatus.SILENT)
 
-Event = tuple[int, str]
+
+class SlotEvent(NamedTuple):
+    """What happened to a slot, 0 is the robot's; detail: see result.Event."""
+
+    slot: int
+    kind: EventKind
+    detail: str = ""
 
 
 @dataclass
@@ -69,7 +77,7 @@ class _Life:
     """What the host knows of one slot. heard: when last [s]; doubted: since when its ranges do not fit [s], None where
     they do; told: whether that was told."""
 
-    status: str = "waiting"
+    status: BeaconStatus = BeaconStatus.WAITING
     heard: float = 0.0
     doubted: float | None = None
     told: bool = False
@@ -103,14 +111,14 @@ class BeaconKeeper:
         self._copied: _Copied | None = None
         self._contradicted: float | None = None  # since when another place explains the robot's ranges [s]
 
-    def status(self, slot: int) -> str:
-        """static, moving, silent, dropped or waiting."""
+    def status(self, slot: int) -> BeaconStatus:
+        """Of a beacon now; never RELATIVE."""
         return self._life(slot).status
 
     def placed(self, slot: int, stamp: int) -> None:
         """Start-up has put a beacon into the state."""
         life = self._life(slot)
-        life.status, life.heard = "static", self._seconds(stamp)
+        life.status, life.heard = BeaconStatus.STATIC, self._seconds(stamp)
 
     def _life(self, slot: int) -> _Life:
         return self._lives.setdefault(slot, _Life())
@@ -121,7 +129,7 @@ class BeaconKeeper:
 
     def look(
         self, state: State, params: Params, pending: list[tuple[StampedFrame, Estimate]]
-    ) -> tuple[State, list[Event]]:
+    ) -> tuple[State, list[SlotEvent]]:
         """The state after what a few frames told about the beacons, and what happened to which slot."""
         self._seconds(pending[0][0].stamp)  # time counts from the first frame
         self._listen(heard(pending, params))
@@ -132,17 +140,17 @@ class BeaconKeeper:
         if found is not None and believed:
             for life in self._lives.values():
                 life.sightings.forget(other=0)
-            return state_edits.put_robot(state, found), [(0, "was carried: found again by its ranges")]
-        events: list[Event] = []
+            return state_edits.put_robot(state, found), [SlotEvent(0, EventKind.ROBOT_CARRIED)]
+        events: list[SlotEvent] = []
         for slot, life in sorted(self._lives.items()):
             known = self._known(state, now, slot)
-            if life.status in ("waiting", "dropped"):
+            if life.status in (BeaconStatus.WAITING, BeaconStatus.DROPPED):
                 state = self._try_to_place(state, known, slot, life, events)
-            elif life.status == "moving":
+            elif life.status is BeaconStatus.MOVING:
                 state = self._follow(state, known, slot, life, events)
             elif share <= _FOUND_SHARE:  # so many at once are not the beacons' fault
                 state = self._watch(state, known, slot, life, span, events)
-            trusted = life.status in ("static", "silent") and life.doubted is None
+            trusted = life.status in (BeaconStatus.STATIC, BeaconStatus.SILENT) and life.doubted is None
             life.sightings.forget(before=now - (_WATCHED_S if trusted else MEMORY_S))
         return state, events
 
@@ -184,55 +192,57 @@ class BeaconKeeper:
                 if (mine & usable).any():
                     life.sightings.add(rows[mine & usable])
 
-    def _try_to_place(self, state: State, known: Known, slot: int, life: _Life, events: list[Event]) -> State:
+    def _try_to_place(self, state: State, known: Known, slot: int, life: _Life, events: list[SlotEvent]) -> State:
         resting = resting_place(life.sightings, known)
         found = resting or carried_place(life.sightings, known)
         if found is None:
             return state
-        self._enter(slot, life, "moving" if resting is None else "static", known)
-        events.append((slot, "placed while it is carried" if resting is None else "placed"))
+        self._enter(slot, life, BeaconStatus.MOVING if resting is None else BeaconStatus.STATIC, known)
+        events.append(SlotEvent(slot, EventKind.PLACED_MOVING if resting is None else EventKind.PLACED))
         return state_edits.place(state, slot, *found, moving=resting is None)
 
-    def _enter(self, slot: int, life: _Life, status: str, known: Known) -> None:
+    def _enter(self, slot: int, life: _Life, status: BeaconStatus, known: Known) -> None:
         """A beacon is at a new place: what was ranged to or from its old one is of no use."""
         life.status, life.doubted, life.told = status, None, False
         life.sightings.forget(before=known.now - 1.0)
         for other in self._lives.values():
             other.sightings.forget(other=slot)
 
-    def _follow(self, state: State, known: Known, slot: int, life: _Life, events: list[Event]) -> State:
+    def _follow(self, state: State, known: Known, slot: int, life: _Life, events: list[SlotEvent]) -> State:
         """A beacon that is being carried: rests, is followed, or is lost."""
         resting = resting_place(life.sightings, known)
         if resting is not None:
-            self._enter(slot, life, "static", known)
-            events.append((slot, "was put down: rests at a new place"))
+            self._enter(slot, life, BeaconStatus.STATIC, known)
+            events.append(SlotEvent(slot, EventKind.PUT_DOWN))
             return state_edits.place(state, slot, *resting, moving=False)
         quiet = known.now - life.heard
         if quiet > _SILENT_S or known.variance[slot] > _LOST_M**2:
-            life.status = "waiting"
-            events.append((slot, "fell silent while it was carried" if quiet > _SILENT_S else "was lost while carried"))
+            life.status = BeaconStatus.WAITING
+            lost = EventKind.SILENT_MOVING if quiet > _SILENT_S else EventKind.LOST_MOVING
+            events.append(SlotEvent(slot, lost))
             return state_edits.remove(state, slot)
         verdict = self._judge(known, slot)
         if verdict.carried is not None:
             return state_edits.place(state, slot, verdict.carried, verdict.rows, moving=True)
         return state
 
-    def _watch(self, state: State, known: Known, slot: int, life: _Life, span: float, events: list[Event]) -> State:
+    def _watch(self, state: State, known: Known, slot: int, life: _Life, span: float, events: list[SlotEvent]) -> State:
         """A beacon that rests: is it still there, and heard?"""
         quiet = known.now - life.heard
         if quiet > _DROP_S:
-            life.status = "dropped"
-            events.append((slot, "dropped: not heard for a minute"))
+            life.status = BeaconStatus.DROPPED
+            events.append(SlotEvent(slot, EventKind.DROPPED))
             return state_edits.remove(state, slot)
-        if (quiet > _SILENT_S) != (life.status == "silent"):
-            life.status = "silent" if quiet > _SILENT_S else "static"
-            events.append((slot, "fell silent" if life.status == "silent" else "is heard again"))
-        if life.status == "silent":
+        silent = quiet > _SILENT_S
+        if silent != (life.status is BeaconStatus.SILENT):
+            life.status = BeaconStatus.SILENT if silent else BeaconStatus.STATIC
+            events.append(SlotEvent(slot, EventKind.SILENT if silent else EventKind.HEARD_AGAIN))
+        if silent:
             return state_edits.loosen(state, slot, _SILENT_WALK**2 * span)
         verdict = self._judge(known, slot)
         if verdict.carried is not None:
-            self._enter(slot, life, "moving", known)
-            events.append((slot, "is being carried"))
+            self._enter(slot, life, BeaconStatus.MOVING, known)
+            events.append(SlotEvent(slot, EventKind.CARRIED))
             return state_edits.place(state, slot, verdict.carried, verdict.rows, moving=True)
         return self._doubt(state, known, slot, life, verdict, events)
 
@@ -242,7 +252,7 @@ class BeaconKeeper:
         """A beacon whose ranges fit neither its place nor a motion: a clock, walls, or only the robot hears it."""
         if verdict.fits:
             if life.told:
-                events.append((slot, "ranges fit again"))
+                events.append(SlotEvent(slot, EventKind.FITS_AGAIN))
             life.doubted, life.told = None, False
             return state
         if life.doubted is None:
@@ -250,12 +260,12 @@ class BeaconKeeper:
             life.sightings.forget(before=known.now - 1.0)  # what it ranged from its old place
         elsewhere = resting_elsewhere(life.sightings, known, slot)
         if elsewhere is not None:
-            self._enter(slot, life, "static", known)
-            events.append((slot, "was moved: rests at a new place"))
+            self._enter(slot, life, BeaconStatus.STATIC, known)
+            events.append(SlotEvent(slot, EventKind.MOVED))
             return state_edits.place(state, slot, *elsewhere, moving=False)
         if known.now - life.doubted > _DOUBTED_S and not life.told:
             life.told = True
-            events.append((slot, f"ranges do not fit ({verdict.bias:+.1f} m): a clock, walls, or it was moved"))
+            events.append(SlotEvent(slot, EventKind.DOUBTED, f"{verdict.bias:+.1f}"))
         return state
 
     def _believes(self, found: np.ndarray | None, share: float, now: float, seen: list[Estimate]) -> bool:
@@ -278,7 +288,7 @@ class BeaconKeeper:
         active = np.asarray(state.active)
         rows, misfit = [], []
         for slot, life in self._lives.items():
-            if not active[slot] or life.status != "static":
+            if not active[slot] or life.status is not BeaconStatus.STATIC:
                 continue
             recent = life.sightings.since(known.now - _CARRIED_S)
             recent = recent[recent[:, OTHER] == 0]

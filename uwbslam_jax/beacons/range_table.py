@@ -70,12 +70,6 @@ def heard(pending: Sequence[tuple[StampedFrame, Estimate]], params: Params) -> H
     )
 
 
-def antenna_at(estimate: Estimate, age: np.ndarray, params: Params) -> np.ndarray:
-    """(R, 2) where the robot's antenna was at each exchange around one estimate [m]."""
-    pose, velocity = np.asarray(estimate.pose, float)[None], np.asarray(estimate.velocity, float)
-    return _antenna(pose, velocity, float(estimate.yaw_rate), age, params)
-
-
 def _antenna(pose, velocity, yaw_rate, age, params) -> np.ndarray:
     heading = pose[:, 2] + yaw_rate * age
     x, y = np.asarray(params.antenna, float)

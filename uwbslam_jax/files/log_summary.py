@@ -73,7 +73,9 @@ class LogSummary:
             rows.append((topic.name, topic.role or "-", str(topic.count), rate, gap, topic.schema))
         widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
         for row in rows:
-            cells = [c.rjust(w) if 2 <= k <= 4 else c.ljust(w) for k, (c, w) in enumerate(zip(row, widths, strict=True))]
+            cells = [
+                c.rjust(w) if 2 <= k <= 4 else c.ljust(w) for k, (c, w) in enumerate(zip(row, widths, strict=True))
+            ]
             lines.append("  " + "  ".join(cells).rstrip())
         if self.beams:
             lines.append(f"beams a scan: {self.beams}")

@@ -17,18 +17,18 @@ import numpy as np
 
 from uwbslam_jax.files.mcap_container import RecordWriter
 from uwbslam_jax.files.ros_types import build, definition, header, pose, quaternion, serialize, time, vector
-from uwbslam_jax.result import BeaconEstimate, MapImage, Result, crop
+from uwbslam_jax.result import BeaconEstimate, BeaconStatus, MapImage, Result, crop
 
 DIAGNOSTICS_PERIOD = 100_000_000  # at most 10 Hz [ns]
 PATH_PERIOD = 100_000_000  # at most 10 Hz [ns]: one message, for looking at; /tf has every pose
 BEACONS_PERIOD = 1_000_000_000  # about 1 Hz [ns]
 MAP_FRAME, UWB_FRAME = "map", "uwb"
-_COLORS = {  # of a beacon, by status
-    "static": (0.1, 0.6, 0.2),
-    "moving": (0.9, 0.5, 0.0),
-    "silent": (0.5, 0.5, 0.5),
-    "dropped": (0.8, 0.1, 0.1),
-    "relative": (0.2, 0.45, 0.8),
+_COLORS = {  # of a beacon
+    BeaconStatus.STATIC: (0.1, 0.6, 0.2),
+    BeaconStatus.MOVING: (0.9, 0.5, 0.0),
+    BeaconStatus.SILENT: (0.5, 0.5, 0.5),
+    BeaconStatus.DROPPED: (0.8, 0.1, 0.1),
+    BeaconStatus.RELATIVE: (0.2, 0.45, 0.8),
 }
 
 
@@ -183,7 +183,7 @@ def _track_markers(stamp: int, known: dict[int, np.ndarray]) -> Any:
     """MarkerArray of beacons on the way, rows t, x, y, sigma: a post, its id and a 2-sigma circle."""
     markers: list[Any] = []
     for number, (_, x, y, sigma) in known.items():
-        markers += _beacon(stamp, number, (float(x), float(y), 0.0), (float(sigma), float(sigma)), "static")
+        markers += _beacon(stamp, number, (float(x), float(y), 0.0), (float(sigma), float(sigma)), BeaconStatus.STATIC)
     return build("visualization_msgs/msg/MarkerArray", markers=markers)
 
 
@@ -199,12 +199,12 @@ def beacon_markers(stamp: int, beacons: list[BeaconEstimate]) -> tuple[str, byte
 
 
 def _beacon(
-    stamp: int, number: int, place: tuple[float, float, float], sigmas: tuple[float, float], status: str
+    stamp: int, number: int, place: tuple[float, float, float], sigmas: tuple[float, float], status: BeaconStatus
 ) -> list[Any]:
     """Post, text and ellipse of a beacon at x, y with the ellipse's bearing [m, m, rad]; sigmas of its axes [m]."""
     x, y, bearing = place
-    color = _COLORS.get(status, _COLORS["silent"])
-    text = str(number) if status == "static" else f"{number} {status}"
+    color = _COLORS.get(status, _COLORS[BeaconStatus.SILENT])
+    text = str(number) if status is BeaconStatus.STATIC else f"{number} {status}"
     ellipse = tuple(max(4.0 * sigma, 0.01) for sigma in sigmas)  # 2 sigma to both sides, never invisible
     return [
         _marker(stamp, "beacon", number, 3, (x, y, 0.5), 0.0, (0.12, 0.12, 1.0), (*color, 1.0)),

@@ -16,7 +16,7 @@ import numpy as np
 
 from uwbslam_jax.errors import RunError
 from uwbslam_jax.files.result_log import write_result_log
-from uwbslam_jax.result import OCCUPIED_THRESHOLD, BeaconEstimate, MapImage, Result, crop, trinary
+from uwbslam_jax.result import OCCUPIED_THRESHOLD, BeaconEstimate, BeaconStatus, MapImage, Result, crop, trinary
 
 FREE_THRESHOLD = 0.196  # below what 205 reads as, (255 - 205) / 255, so that unknown stays unknown
 
@@ -31,7 +31,7 @@ class Run:
       beacon_ids: (N,) int64.
       beacons: (N, 2) positions [m].
       beacon_sigmas: (N, 2) standard deviations in x and y [m].
-      beacon_status: N words.
+      beacon_status: of each.
       summary: the content of summary.json, empty where there is none.
     """
 
@@ -40,7 +40,7 @@ class Run:
     beacon_ids: np.ndarray
     beacons: np.ndarray
     beacon_sigmas: np.ndarray
-    beacon_status: list[str]
+    beacon_status: list[BeaconStatus]
     summary: dict[str, Any]
 
 
@@ -138,7 +138,7 @@ def read_run(directory: str | Path) -> Run:
         with path.open(encoding="utf-8", newline="") as file:
             rows = list(csv.DictReader(file))
         numbers = [[float(row[key]) for key in ("x", "y", "sigma_x", "sigma_y")] for row in rows]
-        ids, status = [int(row["id"]) for row in rows], [row["status"] for row in rows]
+        ids, status = [int(row["id"]) for row in rows], [BeaconStatus(row["status"]) for row in rows]
     except OSError as error:
         raise RunError(f"{path}: {error.strerror or error}") from None
     except (KeyError, ValueError, TypeError) as error:

@@ -12,6 +12,7 @@ import numpy as np
 from uwbslam_jax.estimator import Estimate, map_pose, sight
 from uwbslam_jax.measurements import StampedFrame
 from uwbslam_jax.numerics import Column, carried_along
+from uwbslam_jax.result import Event, EventKind
 from uwbslam_jax.startup import Adopted
 
 _RESIDUALS_EVERY_S = 1.0
@@ -46,7 +47,7 @@ class History:
       map_poses, sight: one entry a frame, see graph: where the map has the robot, and what the match could not see.
       diagnostics: one entry a frame by name.
       residuals: (t, slot, slot, measured minus predicted); tracks: (t, slot, x, y, sigma).
-      events: (stamp, text).
+      events: in order of time.
       left: beacons as they were when one of them last left the state, see `beacons`.
       last_scan: number, frame and estimate of the last frame that had a scan.
     """
@@ -61,7 +62,7 @@ class History:
         self._diagnostics = Column(dtype=_DIAGNOSTICS)
         self.residuals = Column(dtype=_RESIDUAL)
         self.tracks = Column(dtype=_TRACK)
-        self.events: list[tuple[int, str]] = []
+        self.events: list[Event] = []
         self.last_scan: tuple[int, StampedFrame, Estimate] | None = None
         self._residuals_at: dict[tuple[int, int], int] = {}
         self._tracks_at = 0
@@ -145,9 +146,9 @@ class History:
         """Stamps (T,) [ns], map poses (T, 3) in float64 and sight (T,) of all frames."""
         return np.array(self.stamps), np.array(self.map_poses, float), np.array(self.sight)
 
-    def event(self, stamp: int, text: str) -> None:
-        """Something worth telling happened."""
-        self.events.append((stamp, text))
+    def event(self, stamp: int, kind: EventKind, node: int | None = None, detail: str = "") -> None:
+        """Something worth telling happened, see Event."""
+        self.events.append(Event(stamp, kind, node, detail))
 
     def carry_along(self, anchors: np.ndarray, before: np.ndarray, after: np.ndarray) -> None:
         """The map was corrected: its keyframes, at anchors (N,) [ns], moved from before (N, 3) to after. What was

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from uwbslam_jax import __version__
-from uwbslam_jax.result import BeaconEstimate, Result
+from uwbslam_jax.result import BeaconEstimate, BeaconStatus, Result
 from uwbslam_jax.session.history import History
 from uwbslam_jax.session.session import Session
 from uwbslam_jax.startup import Relative
@@ -125,14 +125,14 @@ def _beacons(session: Session, ids: dict[int, int]) -> list[BeaconEstimate]:
     for slot in range(1, len(active)):
         status = session.beacon_status(slot)
         node = session.graph.ranges.node(slot)
-        if node in told and status != "moving":
+        if node in told and status is not BeaconStatus.MOVING:
             position, block = told[node]
             found.append(BeaconEstimate(ids[slot], position, block, status))
         elif active[slot]:
             two = slice(2 * slot, 2 * slot + 2)
             found.append(BeaconEstimate(ids[slot], mean[two], cov[two, two], status))
         elif slot in session.history.beacons:
-            left = status if status in ("moving", "silent") else "dropped"
+            left = status if status in (BeaconStatus.MOVING, BeaconStatus.SILENT) else BeaconStatus.DROPPED
             # one that was dropped is remembered where it rested last
             position, block = told.get((slot, node[1] - 1), session.history.beacons[slot])
             found.append(BeaconEstimate(ids[slot], position.astype(float), block.astype(float), left))
@@ -146,8 +146,8 @@ def _relative_beacons(session: Session, relative: Relative) -> list[BeaconEstima
     found = []
     for k, node in enumerate(relative.nodes):
         if node != robot.id:
-            two = slice(2 * k, 2 * k + 2)
-            found.append(BeaconEstimate(node, relative.positions[k] + shift, relative.cov[two, two], "relative"))
+            place, two = relative.positions[k] + shift, slice(2 * k, 2 * k + 2)
+            found.append(BeaconEstimate(node, place, relative.cov[two, two], BeaconStatus.RELATIVE))
     return found
 
 
@@ -228,7 +228,7 @@ def _summary(session: Session, facts: Facts) -> dict[str, Any]:
         "keyframes": len(session.graph.keyframes),
         "scans_laid_over_others": len(session.graph.edges),
         "revisions": {"solved": session.revisions, "taken_over": session.taken_over},
-        "events": [[round((stamp - int(stamps[0])) / 1e9, 3), text] for stamp, text in history.events],
+        "events": [[round((e.stamp - int(stamps[0])) / 1e9, 3), e.text] for e in history.events],
         "ranges_used": used,
         "ranges_rejected": rejected,
         "found_bias": {str(ids[slot]): bias for slot, bias in sorted(session.found_bias.items())},

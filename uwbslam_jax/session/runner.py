@@ -14,7 +14,7 @@ from uwbslam_jax.estimator import CompileClock, Estimate
 from uwbslam_jax.evaluation import ROBOT, TRUTH, Truth, truth_row
 from uwbslam_jax.measurements import Message, ScanMessage, StampedFrame, TruthMessage
 from uwbslam_jax.numerics import Column
-from uwbslam_jax.result import Result
+from uwbslam_jax.result import Result, RunStatus
 from uwbslam_jax.session.frame_assembler import FrameAssembler
 from uwbslam_jax.session.result_builder import Facts, to_result
 from uwbslam_jax.session.session import CONTROL_EVERY, Session
@@ -66,7 +66,7 @@ class Runner:
     def result(self, facts: Facts) -> Result:
         """The Result so far; odometry, step times and the drops of the frames are added to the facts.
 
-        While the robot waits for motion the beacons are those of the relative geometry, status "relative".
+        While the robot waits for motion the beacons are those of the relative geometry, their status RELATIVE.
         """
         dropped = facts.dropped + self._assembler.dropped
         warnings = [*facts.warnings, *self._assembler.warnings]
@@ -82,7 +82,7 @@ class Runner:
 
     def relative(self) -> Relative | None:
         """Geometry of the nodes among themselves while the robot rests; None where the ranges do not fix one."""
-        if self.session.decided_at is not None or self.session.status != "waiting for motion":
+        if self.session.decided_at is not None or self.session.status is not RunStatus.WAITING:
             return None
         settings = self.session.settings
         return static_geometry.solve(
@@ -106,7 +106,7 @@ class Runner:
         estimates = [self.session.step(frames[0])] if self._group == 1 else self.session.steps(frames)
         seconds = time.perf_counter() - begin - (self._clock.seconds - compiled)
         self._step_ms.extend([max(seconds, 0.0) * 1e3 / len(frames)] * len(frames))
-        if self.session.status == "waiting for motion":
+        if self.session.status is RunStatus.WAITING:
             for frame in frames:
                 self._links.hear(frame, self.session.params, self.session.config.nlos_gap_db)
         return estimates

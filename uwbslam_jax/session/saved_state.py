@@ -23,6 +23,7 @@ from uwbslam_jax.estimator import State, init
 from uwbslam_jax.mapping import Tiles
 from uwbslam_jax.measurements import RangeMessage
 from uwbslam_jax.numerics import Gaussian, locate
+from uwbslam_jax.result import EventKind
 from uwbslam_jax.session.session import Session
 from uwbslam_jax.settings import Settings, make_config, make_params
 
@@ -159,7 +160,7 @@ def go_on(session: Session, saved: Saved, place: np.ndarray, stamp: int, *, fixe
         state = _pinned(state)
     session.fixed = fixed
     session.go_on(state, saved.tiles.copy(), saved.slots, saved.found_bias, stamp)
-    session.history.event(stamp, "localising in a saved map" if fixed else "going on from a saved run")
+    session.history.event(stamp, EventKind.LOCALISING if fixed else EventKind.RESUMED)
 
 
 def _pinned(state: State) -> State:

@@ -32,6 +32,7 @@ from uwbslam_jax.beacons import MEMORY_S, BeaconKeeper
 from uwbslam_jax.estimator import Estimate, State, compiled, init, state_vector
 from uwbslam_jax.mapping import Tiles, redraw
 from uwbslam_jax.measurements import StampedFrame
+from uwbslam_jax.result import BeaconStatus, EventKind, RunStatus
 from uwbslam_jax.session.history import History
 from uwbslam_jax.settings import Params, Settings, make_config, make_params
 from uwbslam_jax.startup import Buffer, adopt, decide
@@ -42,6 +43,17 @@ _NOTABLE_BIAS = 0.3
 """A bias larger than this share of sigma_n is told; smaller ones only take up what little was learnt of them."""
 _SOLVE_EVERY_S = 1.0
 """The start-up problem is solved at most this often, in the log's time."""
+_ELSEWHERE = (
+    EventKind.ROBOT_CARRIED,
+    EventKind.PLACED_MOVING,
+    EventKind.CARRIED,
+    EventKind.PUT_DOWN,
+    EventKind.MOVED,
+    EventKind.LOST_MOVING,
+    EventKind.SILENT_MOVING,
+    EventKind.DROPPED,
+)
+"""After these a node is not where it was. One that is only doubted may be: walls or a clock explain its ranges too."""
 
 
 class Session:
@@ -51,7 +63,7 @@ class Session:
       settings, config, params: what it runs with; params grow biases and heights as ids get slots.
       state: the estimator's.
       decided_at: stamp of the frame at which the published frame was decided, None before [ns].
-      status: of the start-up, in words.
+      status: of the start-up.
       found_bias: slot -> range bias that was found beyond the configured one [m]; empty where there is none.
       history: what was reported so far.
       graph: what the run as a whole is solved from. hindsight: its solution once the run is over, else None.
@@ -69,7 +81,7 @@ class Session:
         self.tiles = Tiles(settings.map.resolution)
         self.history = History()
         self.decided_at: int | None = None
-        self.status = "LiDAR only" if settings.filter.lidar_only else "waiting for motion"
+        self.status = RunStatus.LIDAR_ONLY if settings.filter.lidar_only else RunStatus.WAITING
         self.hypotheses = 0
         self.found_bias: dict[int, float] = {}
         self.listener: Callable[[StampedFrame, Estimate], object] | None = None
@@ -136,7 +148,7 @@ class Session:
         self.params = self._biased(make_params(self.settings, self._slots))
         self.decided_at = stamp
         self._looks_back = False  # the scans that the saved map was drawn from are gone
-        self.status, self.hypotheses = "decided", 1
+        self.status, self.hypotheses = RunStatus.DECIDED, 1
         for slot in np.flatnonzero(np.asarray(state.active))[1:]:
             self._keeper.placed(int(slot), stamp)
 
@@ -219,7 +231,7 @@ class Session:
         ids = {slot: node for node, slot in self._slots.items()}
         outcome = decide.solve(self._buffer, ids)
         if outcome.status != self.status:
-            self.history.event(now, outcome.status)
+            self.history.event(now, EventKind.STATUS, detail=outcome.status)
         self.status, self.hypotheses = outcome.status, outcome.hypotheses
         if outcome.placement is None:
             return
@@ -236,21 +248,20 @@ class Session:
         self._frame_nodes = self.graph.ranges.node(origin), self.graph.ranges.node(along)
         self.history.republish(adopted)
         self.graph.put(adopted.republish(self.graph.stamps(), self.graph.poses()), adopted.turn)
-        self.history.event(now, f"frame decided by beacons {ids[origin]} and {ids[along]}")
+        self.history.event(now, EventKind.FRAME_DECIDED, detail=f"{ids[origin]} and {ids[along]}")
         for slot in outcome.placement.slots:
             self._keeper.placed(slot, now)
-            self.history.event(now, f"beacon {ids[slot]} placed")
+            self.history.event(now, EventKind.PLACED, ids[slot])
         self._buffer = self._new_buffer()
 
     def _keep_beacons(self, pending: list[tuple[StampedFrame, Estimate]]) -> None:
         ids = {slot: node for node, slot in self._slots.items()}
         params = self._params_on_host()
         self.state, events = self._keeper.look(self.state, params, pending)
-        for slot, text in events:
-            who = "robot" if slot == 0 else f"beacon {ids[slot]}"
-            self.history.event(pending[-1][0].stamp, f"{who} {text}")
-            self._remember(slot, text, pending[-1][0].stamp)
-        if any(slot == 0 for slot, _ in events):
+        for slot, kind, detail in events:
+            self.history.event(pending[-1][0].stamp, kind, ids[slot] if slot else None, detail)
+            self._remember(slot, kind, pending[-1][0].stamp)
+        if any(event.kind is EventKind.ROBOT_CARRIED for event in events):
             self._reviser.drop()
         self._revise(pending[-1][0].stamp)
 
@@ -259,11 +270,11 @@ class Session:
             self._copied = (self.params, jax.device_get(self.params))
         return self._copied[1]
 
-    def _remember(self, slot: int, text: str, now: int) -> None:
+    def _remember(self, slot: int, kind: EventKind, now: int) -> None:
         """What an event means for the run as a whole."""
-        if text == "placed":
+        if kind is EventKind.PLACED:
             self.graph.placed(slot, now - round(MEMORY_S * 1e9))
-        elif slot == 0 or any(word in text for word in ("carried", "put down", "was moved", "dropped")):
+        elif kind in _ELSEWHERE:
             if slot in self.history.beacons:
                 self._places[self.graph.ranges.node(slot)] = np.asarray(self.history.beacons[slot][0], float)
             self.graph.moved(slot)
@@ -277,7 +288,7 @@ class Session:
             self._learn_biases(revision.solution, now)
             self._take_over(revision)
             self.taken_over += 1
-            self.history.event(now, "beacons and map corrected by the run so far")
+            self.history.event(now, EventKind.CORRECTED)
         if self._looks_back and self._reviser.wants(len(self.graph.keyframes)):
             question = self._question()
             if question is not None:
@@ -297,9 +308,9 @@ class Session:
         told = self.biased
         self.found_bias = solution.bias
         if self.biased and not told:
-            self.history.event(now, "ranges are biased: biases and beacons solved from the run so far")
+            self.history.event(now, EventKind.BIASED)
         self.params = self._biased(make_params(self.settings, self._slots))
 
-    def beacon_status(self, slot: int) -> str:
-        """static, moving, silent, dropped or waiting."""
+    def beacon_status(self, slot: int) -> BeaconStatus:
+        """Of a beacon now; never RELATIVE."""
         return self._keeper.status(slot)

@@ -68,7 +68,9 @@ class Update:
         for slot, node in sorted(self.ids.items(), key=lambda pair: pair[1]):
             if slot:
                 known = bool(e.active[slot])
-                place = (np.asarray(e.beacons[slot], float), np.asarray(e.beacon_covs[slot], float)) if known else nowhere
+                place = (
+                    (np.asarray(e.beacons[slot], float), np.asarray(e.beacon_covs[slot], float)) if known else nowhere
+                )
                 found[node] = BeaconEstimate(node, *place, self._states.get(slot, BeaconStatus.WAITING))
         return found
 

@@ -15,6 +15,7 @@ import numpy as np
 from uwbslam_jax.estimator import published
 from uwbslam_jax.measurements import Ranges
 from uwbslam_jax.numerics import CALIBRATED_M, DECIDED, SIGMA_ENOUGH_M, largest_sigma, numeric_jacobian
+from uwbslam_jax.result import RunStatus
 from uwbslam_jax.startup.adopt import _last_and_beacons
 from uwbslam_jax.startup.hypotheses import explanations
 from uwbslam_jax.startup.keyframe_buffer import Buffer
@@ -42,7 +43,7 @@ class Outcome:
     """What start-up knows now.
 
     Attributes:
-      status: "waiting for motion", "placing beacons", "reflection undecided" or "decided".
+      status: never LIDAR_ONLY.
       hypotheses: how many explanations are alive (0 before there is one).
       margin: difference of log-likelihood between the two reflections.
       placement: the decided one, else None.
@@ -50,7 +51,7 @@ class Outcome:
         then has them.
     """
 
-    status: str
+    status: RunStatus
     hypotheses: int
     margin: float
     placement: Placement | None
@@ -60,22 +61,22 @@ class Outcome:
 def solve(buffer: Buffer, ids: dict[int, int]) -> Outcome:
     """Place the beacons if what is buffered determines them. ids: slot -> node id."""
     if buffer.extent < _MOVED_ENOUGH_M and not any(key.blind for key in buffer.keyframes[1:]):
-        return Outcome("waiting for motion", 0, 0.0, None)
+        return Outcome(RunStatus.WAITING, 0, 0.0, None)
     problem = Problem.build(buffer)
     if len(problem.slots) < 2:
-        return Outcome("placing beacons", 0, 0.0, None)
+        return Outcome(RunStatus.PLACING, 0, 0.0, None)
     found, bias_sigma = _explain(problem)
     best, biased = found[0], bias_sigma > CALIBRATED_M
     margin = found[1].cost - best.cost if len(found) > 1 else float("inf")
     if margin < DECIDED:
         alive = sum(other.cost - best.cost < DECIDED for other in found)
-        return Outcome("reflection undecided", alive, margin, None, biased)
+        return Outcome(RunStatus.UNDECIDED, alive, margin, None, biased)
     drawn = any(key.information.any() for key in buffer.keyframes)
     sure = _keep_certain(problem.keep_unique(best, bias_sigma), ids, drawn=drawn)
     waits = not drawn and buffer.newest - buffer.keyframes[0].frame.stamp < _UNDRAWN_WAIT_S * 1e9
     if sure is None or (waits and len(sure.slots) < len(problem.slots)):
-        return Outcome("placing beacons", 1, margin, None, biased)
-    return Outcome("decided", 1, margin, sure, biased)
+        return Outcome(RunStatus.PLACING, 1, margin, None, biased)
+    return Outcome(RunStatus.DECIDED, 1, margin, sure, biased)
 
 
 def _explain(problem: Problem) -> tuple[list[Placement], float]:

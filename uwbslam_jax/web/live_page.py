@@ -19,7 +19,7 @@ import numpy as np
 from uwbslam_jax.estimator import Estimate
 from uwbslam_jax.mapping import Grid, Tiles
 from uwbslam_jax.measurements import StampedFrame
-from uwbslam_jax.result import BeaconEstimate
+from uwbslam_jax.result import BeaconEstimate, BeaconStatus, Event as RunEvent, RunStatus
 from uwbslam_jax.session import Session
 from uwbslam_jax.web import page
 from uwbslam_jax.web.page_data import extent, numbers, picture
@@ -34,9 +34,9 @@ _LINK_S = 1.0
 """A link is shown for so long after its last range."""
 _EVENTS = 12
 _HINTS = {
-    "waiting for motion": "Waiting for motion: beacons and frame are found once the robot drives.",
-    "placing beacons": "Placing beacons: not enough is known of them yet. Drive on, and turn.",
-    "reflection undecided": "Reflection undecided: the ranges fit a mirrored place as well until the robot turns.",
+    RunStatus.WAITING: "Waiting for motion: beacons and frame are found once the robot drives.",
+    RunStatus.PLACING: "Placing beacons: not enough is known of them yet. Drive on, and turn.",
+    RunStatus.UNDECIDED: "Reflection undecided: the ranges fit a mirrored place as well until the robot turns.",
 }
 _COLUMNS = ("t", "x", "y", "yaw", "xx", "xy", "yy")
 
@@ -68,10 +68,10 @@ class _Now:
     frame: StampedFrame
     estimate: Estimate
     slots: dict[int, int]
-    states: dict[int, str]
-    status: str
+    states: dict[int, BeaconStatus]
+    status: RunStatus
     decided: bool
-    events: list[tuple[int, str]]
+    events: list[RunEvent]
     links: dict[tuple[int, int], tuple[float, float | None]]
 
 
@@ -207,7 +207,7 @@ class LivePage:
         if bool(e.poor) and now.frame.frame.has_scan:
             notices.append(("info", "The scan does not fit the map: it is not drawn."))
         begin = self._start or 0
-        rows = [(f"{(stamp - begin) / 1e9:.1f}", text) for stamp, text in reversed(now.events)]
+        rows = [(f"{(event.stamp - begin) / 1e9:.1f}", event.text) for event in reversed(now.events)]
         return "words", _json(
             {
                 "notices": page.notices(notices),
@@ -265,7 +265,7 @@ def _estimates(now: _Now) -> list[BeaconEstimate]:
         if slot:
             known = bool(e.active[slot])
             place = (np.asarray(e.beacons[slot], float), np.asarray(e.beacon_covs[slot], float)) if known else nowhere
-            found.append(BeaconEstimate(node, *place, now.states.get(slot, "waiting")))
+            found.append(BeaconEstimate(node, *place, now.states.get(slot, BeaconStatus.WAITING)))
     return found
 
 

@@ -18,13 +18,11 @@ _POSES, _SAMPLES, _RESIDUALS, _PIXELS = 6000, 2000, 12_000, 2000
 # name -> label, unit; the order is that on the page.
 _DIAGNOSTICS: dict[str, tuple[str, str]] = {
     "match_score": ("Match score", ""),
-    "score": ("Match score", ""),
     "step_ms": ("Step time", "ms"),
     "latency_ms": ("Scan arrival to pose", "ms"),
     "hypotheses": ("Hypotheses", ""),
     "ranges_used": ("Ranges used", "a frame"),
     "searched": ("Wide searches", ""),
-    "searches": ("Wide searches", ""),
 }
 
 

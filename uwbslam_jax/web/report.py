@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from uwbslam_jax.result import Result
+from uwbslam_jax.result import BeaconStatus, Result, RunStatus
 from uwbslam_jax.web import page
 from uwbslam_jax.web.page_data import diagnostics, page_data, pair_kinds, pair_residuals, span
 
@@ -104,7 +104,7 @@ def _decided(result: Result) -> tuple[bool, Any]:
 def _notices(result: Result, metrics: Mapping[str, Any] | None) -> Iterator[tuple[str, str]]:
     """What a reader must know before any figure: ("warn" or "info", text)."""
     summary = result.summary
-    if summary.get("status") == "LiDAR only":
+    if summary.get("status") == RunStatus.LIDAR_ONLY:
         yield "info", "LiDAR only: poses and map are in the frame that the robot started in."
     elif not _decided(result)[0]:
         yield (
@@ -126,7 +126,7 @@ def _notices(result: Result, metrics: Mapping[str, Any] | None) -> Iterator[tupl
             "warn",
             f"Slower than real time: a step takes {step:.1f} ms in the mean, a frame {np.median(frames):.1f} ms.",
         )
-    for status in ("moving", "silent", "dropped"):
+    for status in (BeaconStatus.MOVING, BeaconStatus.SILENT, BeaconStatus.DROPPED):
         ids = [str(beacon.id) for beacon in result.beacons if beacon.status == status]
         if ids:
             yield "info", f"{'Beacon' if len(ids) == 1 else 'Beacons'} {', '.join(ids)} {status} at the end."
@@ -189,7 +189,7 @@ def _sections(result: Result, metrics: Mapping[str, Any] | None) -> str:
     """Everything below the map."""
     summary = result.summary
     start = int(result.stamps[0]) if len(result.stamps) else 0
-    events = [(f"{(stamp - start) / 1e9:.2f}", text) for stamp, text in result.events]
+    events = [(f"{(event.stamp - start) / 1e9:.2f}", event.text) for event in result.events]
     dropped = summary.get("dropped") or {}
     plain = [_label(key, value) for key, value in summary.items() if key not in _SHOWN_APART]
     pairs = []
