@@ -247,7 +247,7 @@ class BeaconKeeper:
         return self._doubt(state, known, slot, life, verdict, events)
 
     def _doubt(
-        self, state: State, known: Known, slot: int, life: _Life, verdict: Verdict, events: list[Event]
+        self, state: State, known: Known, slot: int, life: _Life, verdict: Verdict, events: list[SlotEvent]
     ) -> State:
         """A beacon whose ranges fit neither its place nor a motion: a clock, walls, or only the robot hears it."""
         if verdict.fits:
