@@ -52,8 +52,7 @@ def off(run: Session, track: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray,
     """Errors of a track (T,) and of the beacons (B,) after one rigid motion over both [m]."""
     assert run.hindsight is not None
     solution = run.hindsight.solution
-    ids = {slot: node for node, slot in run.slots.items()}
-    spots = np.array([BEACONS[ids[slot]] for slot, _ in solution.nodes])
+    spots = np.array([BEACONS[run.ids[slot]] for slot, _ in solution.nodes])
     a, b = np.concatenate([track[:, :2], solution.beacons]), np.concatenate([truth[:, :2], spots])
     errors = np.linalg.norm(rigid_fit(a, b).points(a) - b, axis=1)
     return errors[: len(track)], errors[len(track) :]

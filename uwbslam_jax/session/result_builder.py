@@ -62,7 +62,7 @@ def to_result(session: Session, facts: Facts) -> Result:
     facts = dataclasses.replace(facts, warnings=[*facts.warnings, *told])
     stamps = history.stamps.values[at]
     start = int(stamps[0]) if len(stamps) else 0
-    ids = {slot: node for node, slot in session.slots.items()}
+    ids = session.ids
     online = np.array(history.poses, float).reshape(-1, 3)
     track = online if session.hindsight is None else session.hindsight.track
     diagnostics = {name: values[at] for name, values in history.diagnostics.items()}
@@ -104,8 +104,7 @@ def _tracks(history: History, ids: dict[int, int], start: int) -> dict[int, np.n
 
 def _biases(session: Session) -> list[str]:
     """A warning where notable biases were found that nobody configured."""
-    ids = {slot: node for node, slot in session.slots.items()}
-    found = {ids[slot]: bias for slot, bias in session.found_bias.items()}
+    found = {session.ids[slot]: bias for slot, bias in session.found_bias.items()}
     told = ", ".join(f"node {node} {bias:+.2f} m" for node, bias in sorted(found.items()))
     advice = "set uwb.bias if the radios are known"
     return [f"ranges are biased: {told} were solved from the run; {advice}"] if session.biased else []
@@ -189,8 +188,7 @@ def _scan_points(session: Session) -> np.ndarray:
 
 def _frame_beacons(session: Session) -> list[int]:
     """Ids of the beacon at the published frame's origin and of the one on +x."""
-    ids = {slot: node for node, slot in session.slots.items()}
-    return [ids[slot] for slot in np.asarray(session.state.frame_slots).tolist()]
+    return [session.ids[slot] for slot in np.asarray(session.state.frame_slots).tolist()]
 
 
 def _summary(session: Session, facts: Facts) -> dict[str, Any]:
@@ -199,7 +197,7 @@ def _summary(session: Session, facts: Facts) -> dict[str, Any]:
     The real-time factor is the recording's duration over the time taken, compilation left out.
     """
     history = session.history
-    ids = {slot: node for node, slot in session.slots.items()}
+    ids = session.ids
     stamps, step_ms = history.stamps, facts.step_ms
     duration = (stamps[-1] - stamps[0]) / 1e9 if stamps else 0.0
     decided = None if session.decided_at is None else max(session.decided_at - stamps[0], 0) / 1e9

@@ -107,8 +107,9 @@ class Runner:
         seconds = time.perf_counter() - begin - (self._clock.seconds - compiled)
         self._step_ms.extend([max(seconds, 0.0) * 1e3 / len(frames)] * len(frames))
         if self.session.status is RunStatus.WAITING:
+            ids = self.session.ids
             for frame in frames:
-                self._links.hear(frame, self.session.params, self.session.config.nlos_gap_db)
+                self._links.hear(frame, ids, self.session.params, self.session.config.nlos_gap_db)
         return estimates
 
 

@@ -106,6 +106,11 @@ class Session:
         return self._slots
 
     @property
+    def ids(self) -> dict[int, int]:
+        """Slot -> node id, as far as heard."""
+        return {slot: node for node, slot in self._slots.items()}
+
+    @property
     def revisions(self) -> int:
         """How often the run so far was solved as a whole."""
         return self._reviser.solved
@@ -228,7 +233,7 @@ class Session:
         if now - self._solved_at < _SOLVE_EVERY_S * 1e9 or self._buffer.newest == self._solved_with:
             return  # nothing can have been learnt but better averages
         self._solved_at, self._solved_with = now, self._buffer.newest
-        ids = {slot: node for node, slot in self._slots.items()}
+        ids = self.ids
         outcome = decide.solve(self._buffer, ids)
         if outcome.status != self.status:
             self.history.event(now, EventKind.STATUS, detail=outcome.status)
@@ -255,7 +260,7 @@ class Session:
         self._buffer = self._new_buffer()
 
     def _keep_beacons(self, pending: list[tuple[StampedFrame, Estimate]]) -> None:
-        ids = {slot: node for node, slot in self._slots.items()}
+        ids = self.ids
         params = self._params_on_host()
         self.state, events = self._keeper.look(self.state, params, pending)
         for slot, kind, detail in events:

@@ -62,9 +62,9 @@ class Links:
         self.rise: dict[Pair, float] = {}
         self._ranges: dict[Pair, deque[tuple[float, bool]]] = {}
 
-    def hear(self, frame: StampedFrame, params: Params, nlos_gap_db: float) -> None:
-        """All ranges of a frame, the configured biases taken off."""
-        r, ids = frame.frame.ranges, {slot: node for node, slot in frame.slots.items()}
+    def hear(self, frame: StampedFrame, ids: dict[int, int], params: Params, nlos_gap_db: float) -> None:
+        """All ranges of a frame, the configured biases taken off. ids: slot -> node id."""
+        r = frame.frame.ranges
         bias, height = np.asarray(params.bias, float), np.asarray(params.height, float)
         scale = 1.0 + float(params.bias_scale)
         for k in np.flatnonzero(r.valid):

@@ -109,7 +109,7 @@ class LivePage:
             self._start = frame.stamp
         t = (frame.stamp - self._start) / 1e9
         before = self._now
-        self._links |= _links(t, frame, estimate, session.slots)
+        self._links |= _links(t, frame, estimate, session.ids)
         if len(session.history.events) != self._events:
             self._events = len(session.history.events)
             self._take_track(session)
@@ -241,10 +241,10 @@ def _scan(now: _Now, lidar: tuple[float, float, float]) -> list[list[float | Non
 
 
 def _links(
-    t: float, frame: StampedFrame, estimate: Estimate, slots: dict[int, int]
+    t: float, frame: StampedFrame, estimate: Estimate, ids: dict[int, int]
 ) -> dict[tuple[int, int], tuple[float, float | None]]:
     """Time and measured less predicted range [m] of each pair of ids that ranged; None where the range was left out."""
-    r, ids = frame.frame.ranges, {slot: node for node, slot in slots.items()}
+    r = frame.frame.ranges
     valid = np.flatnonzero(np.asarray(r.valid) & np.asarray(estimate.active)[r.i] & np.asarray(estimate.active)[r.j])
     found = {}
     for k in valid.tolist():
