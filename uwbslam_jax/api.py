@@ -5,6 +5,7 @@ Batch mode steps groups of frames at once, online mode frame by frame; both give
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import itertools
 import time
@@ -235,6 +236,7 @@ class Slam:
 
     Attributes:
       settings: what it runs with.
+      on_update: called with each update, see `__init__`.
     """
 
     def __init__(
@@ -252,34 +254,36 @@ class Slam:
           resume, localize: see `run`.
           on_update: called with each update before the host looks at what it means for beacons and map, which takes
             longer now and then.
-          fit: make room for as many beams as the first scans have, by holding the first second of messages. Without, for
-            lidar.max_beams, at once.
+          fit: make room for as many beams as the first scans have, by holding the first second of messages. Without,
+            for lidar.max_beams at once.
 
         Raises:
           ConfigError, RunError, UsageError: see `run`.
         """
         self.settings = settings_file.check(settings or Settings())
+        self.on_update = on_update
         self._goes_on = _saved(resume, localize, self.settings)
-        self._on_update = on_update
         self._held: list[Message] = []
-        self._clock, self._begin = CompileClock(), time.perf_counter()
+        self._clock, self._begin = CompileClock(), 0.0
+        self._end = contextlib.ExitStack()
+        self._end.enter_context(self._clock)
         self._runner = None if fit else self._start()
 
     def _start(self) -> Runner:
         saved, fixed = self._goes_on
         runner = Runner(self.settings, self._clock, online=True, saved=saved, fixed=fixed)
-        runner.session.listener = self._on_update
+        runner.session.listener = lambda update: self.on_update(update) if self.on_update is not None else None
         return runner
 
     def add(self, message: Message) -> list[Update]:
         """Takes in one measurement, in the order in which they arrive; what it led to, mostly nothing or one update."""
+        self._begin = self._begin or time.perf_counter()
         if self._runner is None:
             self._held.append(message)
             scans = sum(isinstance(m, ScanMessage) for m in self._held)
             late = message.stamp - self._held[0].stamp > _PEEK_S * 1e9
             return self._release() if scans >= PEEK_SCANS or late else []
-        with self._clock:
-            return self._runner.add(message)
+        return self._runner.add(message)
 
     def _release(self) -> list[Update]:
         """What was held goes in."""
@@ -302,12 +306,11 @@ class Slam:
 
     def map(self) -> MapImage:
         """The map so far."""
-        session = self.runner.session
-        return session.tiles.image(session.state.grid)
+        return self.runner.session.map()
 
     def finish(self, facts: Facts | None = None) -> Result:
         """Ends the run: what still waits is stepped, and the whole run solved once more. facts: told besides."""
-        with self._clock:
+        with self._end:
             self.runner.finish()
         facts = facts or Facts()
         facts.compile_s = self._clock.seconds

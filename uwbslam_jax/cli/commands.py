@@ -6,8 +6,7 @@ Every key of the settings is a flag of `run` (--uwb.sigma-n 0.1); a flag goes be
 from __future__ import annotations
 
 import dataclasses
-import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,16 +16,12 @@ from tqdm import tqdm
 from tyro.conf import Positional, arg
 
 from uwbslam_drivers.emulators.command import EmulateOptions, emulate
-from uwbslam_jax.api import run_log
+from uwbslam_jax import api
 from uwbslam_jax.cli.finish_run import accuracy, deliver, table
 from uwbslam_jax.cli.live_command import LiveOptions, live
 from uwbslam_jax.cli.tune_command import TuneOptions, tune
-from uwbslam_jax.errors import LogError, UsageError
-from uwbslam_jax.evaluation import Truth, evaluate
-from uwbslam_jax.files import LogReader, LogWriter, format_summary, inspect, read_run, settings_file
-from uwbslam_jax.measurements import Message, ScanMessage, TruthMessage
+from uwbslam_jax.files import settings_file
 from uwbslam_jax.settings import Settings
-from uwbslam_jax.sim import SCENARIOS, Scenario, make_scenario, settings_overrides, simulate
 
 
 @dataclass
@@ -43,6 +38,10 @@ class RunOptions:
     """Leave odometry out, short for --odom.no-use."""
     lidar_only: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Leave the ranges out, short for --filter.lidar-only."""
+    resume: Path | None = None
+    """Go on with map and beacons of this folder of a run."""
+    localize: Path | None = None
+    """Start from map and beacons of this folder of a run and only localise: both stay as they are."""
     online: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Step frame by frame as on the robot; the same result, more slowly."""
     quiet: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -104,7 +103,8 @@ def call(name: str, words: Sequence[str]) -> None:
     """Runs one command with its own arguments.
 
     Raises:
-      UwbslamError, OSError: what a user can mend. SystemExit: bad usage (status 2), or help was asked for (0); the text is printed.
+      UwbslamError, OSError: what a user can mend.
+      SystemExit: bad usage (status 2), or help was asked for (0); the text is printed.
     """
     options, run = _COMMANDS[name]
     default = None
@@ -137,44 +137,39 @@ def run(options: RunOptions) -> None:
         settings = dataclasses.replace(settings, odom=dataclasses.replace(settings.odom, use=False))
     if options.lidar_only:
         settings = dataclasses.replace(settings, filter=dataclasses.replace(settings.filter, lidar_only=True))
-    _run_and_write(options.logs, settings_file.check(settings), options.out, quiet=options.quiet, online=options.online)
+    title = f"UWB and LiDAR SLAM: {', '.join(log.name for log in options.logs)}"
+    goes_on = {"online": options.online, "resume": options.resume, "localize": options.localize}
+    _run_and_write(options.logs, settings, options.out, title, quiet=options.quiet, **goes_on)
 
 
 def demo(options: DemoOptions) -> None:
     """The command `demo`."""
     options.out.mkdir(parents=True, exist_ok=True)
-    made = _scenario("workshop", options.seed, options.duration)
+    made = api.simulate("workshop", options.seed, options.duration)
     log = options.out / "demo.mcap"
     _record(made, log, options.quiet)
-    settings = settings_file.from_dict(settings_overrides(made))
-    _run_and_write((log,), settings, options.out, quiet=options.quiet, title="UWB and LiDAR SLAM demo")
+    _run_and_write((log,), made.settings, options.out, "UWB and LiDAR SLAM demo", quiet=options.quiet)
 
 
 def simulate_scenario(options: SimulateOptions) -> None:
     """The command `simulate`."""
-    made = _scenario(options.name, options.seed, options.duration)
+    made = api.simulate(options.name, options.seed, options.duration)
     _record(made, options.out, options.quiet)
-    print(f"recording: {options.out} ({made.duration:.1f} s)")
-    text = settings_file.differences(settings_file.from_dict(settings_overrides(made)))
-    if text:
+    print(f"recording: {options.out} ({made.scenario.duration:.1f} s)")
+    if made.settings != Settings():
         path = options.out.with_suffix(".toml")
-        path.write_text(text, encoding="utf-8")
+        settings_file.save_settings(made.settings, path)
         print(f"settings: {path}")
 
 
 def evaluate_run(options: EvaluateOptions) -> None:
     """The command `evaluate`."""
-    found = read_run(options.directory)
-    beacons = dict(zip(found.beacon_ids.tolist(), found.beacons, strict=True))
-    figures = evaluate(found.stamps, found.poses, beacons, _load_truth(options.truth))
-    print(table(accuracy(figures)))
+    print(table(accuracy(api.evaluate(options.directory, options.truth))))
 
 
 def inspect_log(options: InspectOptions) -> None:
     """The command `inspect`."""
-    s = settings_file.load_settings(options.config) if options.config else Settings()
-    topics = {"scan_topic": s.lidar.topic, "uwb_topic": s.uwb.topic, "odom_topic": s.odom.topic}
-    print(format_summary(inspect(options.logs, **topics, robot_id=s.robot.id, max_range=s.uwb.max_range)))
+    print(api.inspect(options.logs, settings_file.load_settings(options.config) if options.config else None))
 
 
 _COMMANDS: dict[str, tuple[Any, Callable[[Any], None]]] = {
@@ -193,15 +188,10 @@ _COMMANDS: dict[str, tuple[Any, Callable[[Any], None]]] = {
 
 
 def _run_and_write(
-    logs: tuple[Path, ...],
-    settings: Settings,
-    out: Path,
-    *,
-    quiet: bool,
-    online: bool = False,
-    title: str | None = None,
+    logs: tuple[Path, ...], settings: Settings, out: Path, title: str, *, quiet: bool, **how: Any
 ) -> None:
-    """Runs a recording, writes every file of the run and prints its figures."""
+    """Runs a recording, writes every file of the run and prints its figures. how: see api.run."""
+    settings_file.check(settings)
     out.mkdir(parents=True, exist_ok=True)  # before the long work, not after it
     with tqdm(desc="run", unit="msg", leave=False, disable=True if quiet else None) as bar:
 
@@ -209,38 +199,13 @@ def _run_and_write(
             bar.total = total
             bar.update(done - bar.n)
 
-        result, truth = run_log(logs, settings, online=online, progress=progress)
-    deliver(result, truth, out, title or f"UWB and LiDAR SLAM: {', '.join(log.name for log in logs)}")
+        result = api.run(logs, settings, progress=progress, **how)
+    deliver(result, out, title)
 
 
-def _scenario(name: str, seed: int, duration: float | None) -> Scenario:
-    if name not in SCENARIOS:
-        raise UsageError(f"no scenario {name}; there are {', '.join(SCENARIOS)}")
-    if seed < 0:
-        raise UsageError(f"seed {seed}: must not be negative")
-    if duration is not None and not 0.0 < duration < 1e6:
-        raise UsageError(f"duration {duration:g} s: must be greater than 0")
-    return make_scenario(name, seed, duration)
-
-
-def _record(made: Scenario, path: Path, quiet: bool) -> None:
-    """Writes the messages of a scenario."""
-    scans = int(made.duration * made.lidar.rate)
+def _record(made: api.Simulation, path: Path, quiet: bool) -> None:
+    """Writes the messages of a simulation."""
+    scans = int(made.scenario.duration * made.scenario.lidar.rate)
     bar = tqdm(desc="simulate", unit="scan", total=scans, leave=False, disable=True if quiet else None)
-    with LogWriter(path) as writer, bar:
-        for message in simulate(made):
-            writer.write(message)
-            bar.update(isinstance(message, ScanMessage))
-
-
-def _load_truth(path: Path) -> Truth:
-    """Ground truth of a recording or of an .npz file."""
-    try:
-        if path.suffix == ".npz":
-            return Truth.load(path)
-        messages: Iterator[Message] = iter(LogReader(path, scan_topic=None, uwb_topic=None, odom_topic=None))
-        return Truth.from_messages(m for m in messages if isinstance(m, TruthMessage))
-    except LogError:
-        raise
-    except (ValueError, zipfile.BadZipFile) as error:
-        raise UsageError(str(error) if str(path) in str(error) else f"{path}: {error}") from None
+    with bar:
+        made.save(path, lambda scans: bar.update(scans - bar.n))

@@ -7,31 +7,21 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from uwbslam_jax.evaluation import Truth, consistency, evaluate
-from uwbslam_jax.files import write_result
-from uwbslam_jax.result import Result
-from uwbslam_jax.web import write_report
+from uwbslam_jax.api import Result
 
 
-def deliver(result: Result, truth: Truth | None, out: Path, title: str) -> None:
+def deliver(result: Result, out: Path, title: str) -> None:
     """Writes every file of a run into a folder and prints its figures.
 
     Raises:
       OSError: a file cannot be written.
     """
-    figures = None
-    if truth is not None:
-        beacons = {beacon.id: beacon.position for beacon in result.beacons}
-        figures = evaluate(result.stamps, result.poses, beacons, truth) | consistency(result, truth)
-        figures["online_ate_m"] = evaluate(result.stamps, result.online, {}, truth)["robot_ate_m"]
-    write_report(result, out / "report.html", figures, title)
-    result.summary |= figures or {}
-    write_result(result, out)
+    result.save(out, title)
     for warning in result.summary["warnings"]:
         print(f"warning: {warning}", file=sys.stderr)
     if result.summary["truncated"]:
         print(f"warning: {result.summary['truncated']}", file=sys.stderr)
-    print(table([*accuracy(figures or {}), *effort(result)]))
+    print(table([*accuracy(result.summary), *effort(result)]))
     print(f"report: {out / 'report.html'}")
 
 

@@ -18,12 +18,12 @@ from typing import Annotated
 import tyro
 from tyro.conf import arg
 
+from uwbslam_jax.api import Slam
 from uwbslam_jax.cli.finish_run import deliver
 from uwbslam_jax.errors import UsageError
 from uwbslam_jax.evaluation import Truth
 from uwbslam_jax.files import settings_file
 from uwbslam_jax.live import Devices, LiveRun, Publisher, rehearse
-from uwbslam_jax.session import saved_state
 from uwbslam_jax.settings import Settings
 from uwbslam_jax.sim import SCENARIOS, make_scenario, settings_overrides
 from uwbslam_jax.web import LivePage, LiveView, parse_address
@@ -73,12 +73,12 @@ def live(options: LiveOptions) -> None:
     """The command `live`.
 
     Raises:
-      DriverError, UsageError: a URL, port or option that cannot be met. LogError, RunError, OSError: a file that cannot be used.
+      DriverError, UsageError: a URL, port or option that cannot be met.
+      LogError, RunError, OSError: a file that cannot be used.
     """
     settings = _check(options)
     devices = None if options.lidar is None else Devices(options.lidar, options.uwb)
-    started = options.resume or options.localize
-    saved = None if started is None else saved_state.load(started, settings)
+    slam = Slam(settings, resume=options.resume, localize=options.localize, fit=False)
     options.out.mkdir(parents=True, exist_ok=True)
     with contextlib.ExitStack() as ends, _until_told(options.duration) as go:
         page, publisher = _outputs(options, ends)
@@ -89,22 +89,15 @@ def live(options: LiveOptions) -> None:
         if not go():
             raise KeyboardInterrupt
         recording = options.out / f"live-{datetime.now(UTC):%Y%m%d-%H%M%S}.mcap"
-        run = LiveRun(
-            settings,
-            devices,
-            recording,
-            page=page,
-            publisher=publisher,
-            saved=saved,
-            fixed=options.localize is not None,
-        )
+        run = LiveRun(slam, devices, recording, page=page, publisher=publisher)
         print(f"recording to {recording}; Ctrl-C ends", flush=True)
         result = run.run(go)
         if not result.summary["steps"]:
             raise UsageError(f"nothing was measured: {'; '.join(devices.troubles())}")
     truth = options.out / _TRUTH
-    known = Truth.load(truth) if options.emulate is not None and truth.exists() else None
-    deliver(result, known if len(result.stamps) else None, options.out, f"UWB and LiDAR SLAM: {recording.name}")
+    if options.emulate is not None and truth.exists() and len(result.stamps):
+        result.truth = Truth.load(truth)
+    deliver(result, options.out, f"UWB and LiDAR SLAM: {recording.name}")
     print(_told(result.summary))
 
 
@@ -118,8 +111,6 @@ def _told(summary: dict) -> str:
 
 def _check(options: LiveOptions) -> Settings:
     """The settings, if all options are sound."""
-    if options.resume is not None and options.localize is not None:
-        raise UsageError("--resume and --localize: one of them")
     if options.duration is not None and not options.duration > 0.0:
         raise UsageError(f"duration {options.duration:g} s: must be greater than 0")
     if options.emulate is not None:

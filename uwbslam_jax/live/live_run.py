@@ -1,4 +1,4 @@
-"""A live run: devices -> inbox -> session -> recording, view, publisher and, at the end, a Result. Prints nothing.
+"""A live run: devices -> queue -> Slam -> recording, view, publisher and, at the end, a Result. Prints nothing.
 
 Devices and recorder have threads of their own; one loop takes messages in the order of their arrival and steps.
 """
@@ -18,15 +18,13 @@ import numpy as np
 
 from uwbslam_drivers.clock import host_time
 from uwbslam_jax import process
-from uwbslam_jax.estimator import CompileClock, Estimate
+from uwbslam_jax.api import Result, Slam
 from uwbslam_jax.live.devices import Devices
-from uwbslam_jax.live.message_queue import Arrival, Inbox
+from uwbslam_jax.live.message_queue import Inbox
 from uwbslam_jax.live.publisher import Publisher
 from uwbslam_jax.live.recorder import LogRecorder
-from uwbslam_jax.measurements import ScanMessage, StampedFrame
-from uwbslam_jax.result import Result
-from uwbslam_jax.session import Facts, Locator, Runner, Saved, saved_state
-from uwbslam_jax.settings import Settings
+from uwbslam_jax.measurements import ScanMessage
+from uwbslam_jax.session import Facts, Saved, Update, saved_state
 from uwbslam_jax.web import LivePage, Status
 
 _IDLE_S = 0.05
@@ -49,37 +47,30 @@ class LiveRun:
 
     def __init__(
         self,
-        settings: Settings,
+        slam: Slam,
         devices: Devices,
         recording: Path,
         *,
         page: LivePage | None = None,
         publisher: Publisher | None = None,
-        saved: Saved | None = None,
-        fixed: bool = False,
     ):
         """Opens the recording.
 
         Args:
+          slam: the run, with room for lidar.max_beams beams.
           page, publisher: who is told of each step.
-          saved: go on from this; fixed: and only localise.
 
         Raises:
           LogError: the recording cannot be opened.
         """
         self.recording = recording
-        self._settings, self._devices, self._page, self._publisher = settings, devices, page, publisher
-        self._saved, self._fixed = saved, fixed
-        self._locator = Locator(saved, settings) if saved is not None else None
-        self._recorder = LogRecorder(recording, settings)
-        self._inbox = Inbox(self._recorder.record)
-        self._recorder.tick = lambda: self._inbox.thin(host_time())
-        self._clock = CompileClock()
-        self._runner = Runner(settings, self._clock, online=True)
-        self._runner.session.listener = self._publish
+        self._slam, self._devices, self._page, self._publisher = slam, devices, page, publisher
+        slam.on_update = self._publish
+        self._recorder = LogRecorder(recording, slam.settings)
+        self._queue = Inbox(self._recorder.record)
+        self._recorder.tick = lambda: self._queue.thin(host_time())
         self._scan_received: int | None = None
         self._latency_ms = array("f")
-        self._not_located: Counter[str] = Counter()
         self._beams: set[int] = set()
         self._status, self._status_at = Status(), 0.0
         self._measured: dict[str, int] = {}
@@ -88,20 +79,18 @@ class LiveRun:
 
     def run(self, go: Callable[[], bool]) -> Result:
         """Runs for as long as `go` says, which is asked between two messages. Raises what a device's driver raised."""
-        begin = time.perf_counter()
         interval = sys.getswitchinterval()
         sys.setswitchinterval(_SWITCH_S)
         gc.collect()
         gc.freeze()  # what is there by now stays: no pause to look through it again
         try:
-            with self._clock:
-                self._devices.start(self._inbox)
-                while go() and self._devices.defect is None:
-                    self._turn(_IDLE_S)
-                self._devices.close()
-                while self._turn(0.0):
-                    pass
-                self._runner.finish()
+            self._devices.start(self._queue)
+            while go() and self._devices.defect is None:
+                self._turn(_IDLE_S)
+            self._devices.close()
+            while self._turn(0.0):
+                pass
+            result = self._slam.finish(Facts(dropped=self._dropped()))
         finally:
             self._devices.close()
             self._recorder.close()
@@ -110,11 +99,12 @@ class LiveRun:
         if self._devices.defect is not None:
             raise self._devices.defect
         self._save(wait=True)
-        return self._result(time.perf_counter() - begin)
+        self._tell(result)
+        return result
 
     def _turn(self, timeout: float) -> bool:
         """One message, if there is one within a time [s]."""
-        arrival = self._inbox.take(host_time(), timeout)
+        arrival = self._queue.take(host_time(), timeout)
         if time.monotonic() - self._status_at > _STATUS_S:
             self._refresh()
         if arrival is None:
@@ -122,29 +112,17 @@ class LiveRun:
         if isinstance(arrival.message, ScanMessage):
             self._scan_received = arrival.received
             self._beams.add(arrival.message.ranges.size)
-        if self._locator is None or self._located(self._locator, arrival):
-            self._runner.add(arrival.message)
-        else:
-            self._not_located["message: before the robot was located"] += 1
+        self._slam.add(arrival.message)
         return True
 
-    def _located(self, locator: Locator, arrival: Arrival) -> bool:
-        """Whether the robot was found among the saved beacons; starts the session there once it is."""
-        place = locator.hear(arrival.log_time, arrival.message)
-        if place is not None and self._saved is not None:
-            self._runner.know(self._saved.slots)
-            saved_state.go_on(self._runner.session, self._saved, place, arrival.message.stamp, fixed=self._fixed)
-            self._locator = None
-        return False
-
-    def _publish(self, frame: StampedFrame, estimate: Estimate) -> None:
-        """Called with each estimate, before the host looks at what it means for start-up and beacons."""
-        session = self._runner.session
+    def _publish(self, update: Update) -> None:
+        """Called with each update, before the host looks at what it means for start-up and beacons."""
+        session = self._slam.runner.session
         if self._publisher is not None:
-            self._publisher.step(session, frame, estimate)
+            self._publisher.step(session, update)
         if self._page is not None:
-            self._page.step(session, frame, estimate, self._status)
-        if frame.frame.has_scan and self._scan_received is not None:
+            self._page.step(session, update, self._status)
+        if update.frame.frame.has_scan and self._scan_received is not None:
             self._latency_ms.append((host_time() - self._scan_received) / 1e6)
 
     def _refresh(self) -> None:
@@ -158,21 +136,20 @@ class LiveRun:
         latency = (float(np.median(recent)), float(np.percentile(recent, 99))) if len(recent) else None
         troubles = self._devices.troubles()
         troubles += [f"recording: {self._recorder.failure}"] if self._recorder.failure else []
-        self._status = Status(rates, dict(self._dropped()), latency, troubles)
+        self._status = Status(rates, dict(self._dropped() + self._slam.runner.not_located), latency, troubles)
         if now - self._saved_at > _SAVE_S and self._save(wait=False):
             self._saved_at = now
 
     def _save(self, *, wait: bool) -> bool:
         """Writes the state in a thread, which may be waited for. False where there is nothing to save, before the frame
         is decided, or the last one is still being written."""
-        session = self._runner.session
         if self._saver is not None and (wait or not self._saver.is_alive()):
             self._saver.join()
             self._saver = None
-        known = session.decided_at is not None or session.settings.filter.lidar_only
-        if self._fixed or self._locator is not None or not known or self._saver is not None:
+        saved = self._slam.runner.saved() if self._saver is None else None
+        if saved is None:
             return False
-        self._saver = threading.Thread(target=self._write_state, args=(saved_state.snapshot(session),), daemon=True)
+        self._saver = threading.Thread(target=self._write_state, args=(saved,), daemon=True)
         self._saver.start()
         if wait:
             self._saver.join()
@@ -186,28 +163,27 @@ class LiveRun:
         process.give_back()
 
     def _dropped(self) -> Counter[str]:
-        counts: Counter[str] = self._inbox.dropped + self._not_located
+        counts: Counter[str] = Counter(self._queue.dropped)
         for source in self._devices.sources.values():
             counts.update({why: n for why, n in source.counts.items() if why not in _NO_LOSS})
         return counts
 
-    def _result(self, wall_s: float) -> Result:
-        warnings = [f"recording: {self._recorder.failure}"] if self._recorder.failure else []
-        most = self._settings.lidar.max_beams
+    def _tell(self, result: Result) -> None:
+        """What only a live run knows goes into the Result."""
+        summary, most = result.summary, self._slam.settings.lidar.max_beams
+        if self._recorder.failure:
+            summary["warnings"].append(f"recording: {self._recorder.failure}")
         if self._beams and max(self._beams) != most:
-            warnings.append(
+            summary["warnings"].append(
                 f"scans have {max(self._beams)} beams, there was room for {most}: with --lidar.max-beams "
                 f"{max(self._beams)} steps are faster and the recording gives the same bits again"
             )
-        facts = Facts(warnings, self._dropped(), compile_s=self._clock.seconds, wall_s=wall_s)
-        result = self._runner.result(facts)
         latency = np.array(self._latency_ms)
         if len(latency) == len(result.stamps):
             result.diagnostics["latency_ms"] = latency
-        result.summary |= {
+        summary |= {
             "latency_ms_median": float(np.median(latency)) if len(latency) else None,
             "latency_ms_p99": float(np.percentile(latency, 99)) if len(latency) else None,
             "recording": self.recording.name,
             "devices": self._devices.counts(),
         }
-        return result

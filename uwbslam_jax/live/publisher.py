@@ -11,11 +11,8 @@ from typing import Any
 import numpy as np
 
 from uwbslam_jax.errors import UsageError
-from uwbslam_jax.estimator import Estimate
 from uwbslam_jax.files import result_log, ros_types
-from uwbslam_jax.measurements import StampedFrame
-from uwbslam_jax.result import BeaconEstimate
-from uwbslam_jax.session import Session
+from uwbslam_jax.session import Session, Update
 
 BEACONS_S = 1.0
 MAP_S = 5.0
@@ -44,20 +41,19 @@ class Publisher:
         self._channels: dict[str, Any] = {}
         self._told_at = self._map_at = 0.0
 
-    def step(self, session: Session, frame: StampedFrame, estimate: Estimate) -> None:
+    def step(self, session: Session, update: Update) -> None:
         """Takes in one step; called by the loop."""
-        stamp, now = frame.stamp, time.monotonic()
-        x, y, yaw = np.asarray(estimate.pose, float).tolist()
-        self._log(
-            "/pose", result_log.pose_with_covariance(stamp, x, y, yaw, np.asarray(estimate.pose_cov, float)), stamp
-        )
+        stamp, now = update.stamp, time.monotonic()
+        x, y, yaw = update.pose.tolist()
+        self._log("/pose", result_log.pose_with_covariance(stamp, x, y, yaw, update.cov), stamp)
         self._log("/tf", result_log.robot_transform(stamp, x, y, yaw), stamp)
         if now - self._told_at > BEACONS_S:
             self._told_at = now
-            self._log("/beacons", result_log.beacon_markers(stamp, _beacons(session, estimate)), stamp)
+            placed = [b for b in update.beacons.values() if np.isfinite(b.position).all()]
+            self._log("/beacons", result_log.beacon_markers(stamp, placed), stamp)
         if now - self._map_at > MAP_S and session.state.scans_drawn > 0:
             self._map_at = now
-            self._log("/map", result_log.occupancy(session.tiles.image(session.state.grid), stamp), stamp)
+            self._log("/map", result_log.occupancy(session.map(), stamp), stamp)
 
     def close(self) -> None:
         """Ends all connections."""
@@ -70,16 +66,3 @@ class Publisher:
             channel = self._foxglove.Channel(topic, schema=schema, message_encoding="cdr", context=self._context)
             self._channels[topic] = channel
         self._channels[topic].log(data, log_time=stamp)
-
-
-def _beacons(session: Session, estimate: Estimate) -> list[BeaconEstimate]:
-    placed = [(node, slot) for node, slot in session.slots.items() if slot and estimate.active[slot]]
-    return [
-        BeaconEstimate(
-            node,
-            np.asarray(estimate.beacons[slot], float),
-            np.asarray(estimate.beacon_covs[slot], float),
-            session.beacon_status(slot),
-        )
-        for node, slot in placed
-    ]

@@ -3,6 +3,7 @@
 from uwbslam_jax.session import saved_state as saved_state
 from uwbslam_jax.session.frame_assembler import FrameAssembler as FrameAssembler
 from uwbslam_jax.session.result_builder import Facts as Facts
-from uwbslam_jax.session.runner import Runner as Runner, fit_beams as fit_beams
-from uwbslam_jax.session.saved_state import Locator as Locator, Saved as Saved
+from uwbslam_jax.session.runner import PEEK_SCANS as PEEK_SCANS, Runner as Runner, fit_beams as fit_beams
+from uwbslam_jax.session.saved_state import Saved as Saved
 from uwbslam_jax.session.session import CONTROL_EVERY as CONTROL_EVERY, Session as Session
+from uwbslam_jax.session.update import Update as Update

@@ -12,9 +12,11 @@ from typing import Any
 import numpy as np
 
 from uwbslam_jax import __version__
+from uwbslam_jax.numerics import turned
 from uwbslam_jax.result import BeaconEstimate, BeaconStatus, Result
 from uwbslam_jax.session.history import History
 from uwbslam_jax.session.session import Session
+from uwbslam_jax.session.update import scan_points
 from uwbslam_jax.startup import Relative
 
 _NO_SCAN = "no scan: the track is that of odometry and ranges, the map is empty"
@@ -75,7 +77,7 @@ def to_result(session: Session, facts: Facts) -> Result:
         online_covs=history.covs.values[at],
         beacons=_beacons(session, ids) if facts.relative is None else _relative_beacons(session, facts.relative),
         beacon_tracks=_tracks(history, ids, start),
-        map=session.tiles.image(session.state.grid),
+        map=session.map(),
         range_residuals=_residuals(history, ids, start),
         scan_points=_scan_points(session),
         diagnostics=diagnostics,
@@ -170,20 +172,12 @@ def _scan_points(session: Session) -> np.ndarray:
     if session.history.last_scan is None:
         return np.zeros((0, 2))
     number, frame, estimate = session.history.last_scan
-    scan, lidar = frame.frame.scan, session.settings.robot.lidar
-    beam = np.flatnonzero(scan.valid)
-    bearing = float(scan.angle_min) + float(scan.angle_increment) * beam + lidar[2]
-    reach, age = np.asarray(scan.ranges, float)[beam], float(scan.time_increment) * beam
-    x, y = lidar[0] + reach * np.cos(bearing), lidar[1] + reach * np.sin(bearing)
     # the estimate may be older than the published frame: its velocity counts relative to its own heading
     track = session.history.poses if session.hindsight is None else session.hindsight.track
     pose, velocity = track[number], np.asarray(estimate.velocity, float)
-    turned = pose[2] - float(estimate.pose[2])
-    c, s = np.cos(turned), np.sin(turned)
-    drift = np.array([c * velocity[0] - s * velocity[1], s * velocity[0] + c * velocity[1]])
-    heading = pose[2] + float(estimate.yaw_rate) * age
-    c, s = np.cos(heading), np.sin(heading)
-    return pose[:2] + np.stack([c * x - s * y, s * x + c * y], axis=-1) + age[:, None] * drift
+    drift = turned(pose[2] - float(estimate.pose[2]), velocity)
+    motion = np.append(drift, float(estimate.yaw_rate))
+    return scan_points(frame.frame.scan, session.settings.robot.lidar, pose, motion)
 
 
 def _frame_beacons(session: Session) -> list[int]:

@@ -6,22 +6,25 @@ import dataclasses
 import itertools
 import time
 from array import array
+from collections import Counter
 from collections.abc import Iterable
 
 import numpy as np
 
-from uwbslam_jax.estimator import CompileClock, Estimate
+from uwbslam_jax.estimator import CompileClock
 from uwbslam_jax.evaluation import ROBOT, TRUTH, Truth, truth_row
 from uwbslam_jax.measurements import Message, ScanMessage, StampedFrame, TruthMessage
 from uwbslam_jax.numerics import Column
 from uwbslam_jax.result import Result, RunStatus
 from uwbslam_jax.session.frame_assembler import FrameAssembler
 from uwbslam_jax.session.result_builder import Facts, to_result
+from uwbslam_jax.session.saved_state import Locator, Saved
 from uwbslam_jax.session.session import CONTROL_EVERY, Session
+from uwbslam_jax.session.update import Update
 from uwbslam_jax.settings import Settings
 from uwbslam_jax.startup import Links, Relative, static_geometry
 
-_PEEK_SCANS = 10
+PEEK_SCANS = 10
 """So many scans tell how many beams a scan has."""
 _VARYING_BEAMS = 1.25
 """Room for larger scans than those peeked at, where the scanner's number of beams varies."""
@@ -33,9 +36,25 @@ class Runner:
     Attributes:
       session: the estimator's.
       truths: rows of the ground truth so far.
+      not_located: messages that came before the robot was located in a saved map, by reason.
     """
 
-    def __init__(self, settings: Settings, clock: CompileClock, *, online: bool = False):
+    def __init__(
+        self,
+        settings: Settings,
+        clock: CompileClock,
+        *,
+        online: bool = False,
+        saved: Saved | None = None,
+        fixed: bool = False,
+    ):
+        """Nothing is stepped yet.
+
+        Args:
+          clock: what JAX compiles while it is entered does not count as a step's time.
+          online: step frame by frame.
+          saved: go on from this, once the robot is located in it; fixed: and only localise.
+        """
         self.session = Session(settings)
         self.truths = Column(dtype=TRUTH)
         self._assembler = FrameAssembler(settings, self.session.config.max_ranges)
@@ -44,31 +63,46 @@ class Runner:
         self._waiting: list[StampedFrame] = []
         self._step_ms = array("f")
         self._links = Links()
+        self._saved, self._fixed = saved, fixed
+        self._locator = None if saved is None else Locator(saved, settings)
+        self.not_located: Counter[str] = Counter()
 
-    def know(self, slots: dict[int, int]) -> None:
-        """Nodes that have slots before they are heard: those of an earlier run."""
-        self._assembler.slots.update(slots)
-
-    def add(self, message: Message) -> list[Estimate]:
-        """The estimates that a message leads to; in batch mode they come in groups."""
+    def add(self, message: Message) -> list[Update]:
+        """Takes in a message; the updates that it leads to, none in batch mode."""
         if isinstance(message, TruthMessage):
             self.truths.append(truth_row(message))
             return []
-        return [e for frame in self._assembler.add(message) for e in self._take(frame)]
+        if self._locator is not None:
+            self._locate(self._locator, message)
+            return []
+        return [update for frame in self._assembler.add(message) for update in self._take(frame)]
 
-    def finish(self) -> list[Estimate]:
-        """The estimates of what still waits."""
-        estimates = [e for frame in self._assembler.flush() for e in self._take(frame)]
-        estimates += self._step()
+    def _locate(self, locator: Locator, message: Message) -> None:
+        """Looks for the robot among the saved beacons; starts the session there once it is found."""
+        self.not_located["message: before the robot was located"] += 1
+        place = locator.hear(message.stamp, message)
+        if place is not None and self._saved is not None:
+            self._assembler.slots.update(self._saved.slots)
+            self.session.go_on(self._saved, place, message.stamp, fixed=self._fixed)
+            self._locator = None
+
+    def saved(self) -> Saved | None:
+        """What to go on from, see Session.saved; None while the robot is not located."""
+        return self.session.saved() if self._locator is None else None
+
+    def finish(self) -> list[Update]:
+        """The updates of what still waits."""
+        updates = [update for frame in self._assembler.flush() for update in self._take(frame)]
+        updates += self._step()
         self.session.finish()
-        return estimates
+        return updates
 
     def result(self, facts: Facts) -> Result:
         """The Result so far; odometry, step times and the drops of the frames are added to the facts.
 
         While the robot waits for motion the beacons are those of the relative geometry, their status RELATIVE.
         """
-        dropped = facts.dropped + self._assembler.dropped
+        dropped = facts.dropped + self._assembler.dropped + self.not_located
         warnings = [*facts.warnings, *self._assembler.warnings]
         told = dataclasses.replace(
             facts,
@@ -94,23 +128,27 @@ class Runner:
         known = bool(np.any(self.truths["node"] == ROBOT))
         return Truth.from_rows(self.truths.values) if known else None
 
-    def _take(self, frame: StampedFrame) -> list[Estimate]:
+    def _take(self, frame: StampedFrame) -> list[Update]:
         self._waiting.append(frame)
         return self._step() if len(self._waiting) == self._group else []
 
-    def _step(self) -> list[Estimate]:
+    def _step(self) -> list[Update]:
         frames, self._waiting = self._waiting, []
         if not frames:
             return []
         begin, compiled = time.perf_counter(), self._clock.seconds
-        estimates = [self.session.step(frames[0])] if self._group == 1 else self.session.steps(frames)
+        updates = []
+        if self._group == 1:
+            updates = [self.session.update(frames[0], self.session.step(frames[0]))]
+        else:
+            self.session.steps(frames)
         seconds = time.perf_counter() - begin - (self._clock.seconds - compiled)
         self._step_ms.extend([max(seconds, 0.0) * 1e3 / len(frames)] * len(frames))
         if self.session.status is RunStatus.WAITING:
             ids = self.session.ids
             for frame in frames:
                 self._links.hear(frame, ids, self.session.params, self.session.config.nlos_gap_db)
-        return estimates
+        return updates
 
 
 def fit_beams(settings: Settings, messages: Iterable[Message]) -> Settings:
@@ -120,7 +158,7 @@ def fit_beams(settings: Settings, messages: Iterable[Message]) -> Settings:
     the least will do.
     """
     scans = (m.ranges.size for m in messages if isinstance(m, ScanMessage) and m.ranges.size > 1)
-    sizes = list(itertools.islice(scans, _PEEK_SCANS))
+    sizes = list(itertools.islice(scans, PEEK_SCANS))
     beams = max(sizes, default=2) if len(set(sizes)) <= 1 else round(max(sizes) * _VARYING_BEAMS)
     beams = min(beams, settings.lidar.max_beams)
     return dataclasses.replace(settings, lidar=dataclasses.replace(settings.lidar, max_beams=beams))

@@ -23,8 +23,6 @@ from uwbslam_jax.estimator import State, init
 from uwbslam_jax.mapping import Tiles
 from uwbslam_jax.measurements import RangeMessage
 from uwbslam_jax.numerics import Gaussian, locate
-from uwbslam_jax.result import EventKind
-from uwbslam_jax.session.session import Session
 from uwbslam_jax.settings import Settings, make_config, make_params
 
 FILE = "state.npz"
@@ -52,12 +50,6 @@ class Saved:
     tiles: Tiles
     slots: dict[int, int]
     found_bias: dict[int, float]
-
-
-def snapshot(session: Session) -> Saved:
-    """What a session has found so far; a copy, as a step takes its state's memory over."""
-    state = jax.tree.map(lambda leaf: np.array(leaf, copy=True), session.state)
-    return Saved(state, session.tiles.copy(), dict(session.slots), dict(session.found_bias))
 
 
 def save(saved: Saved, directory: Path) -> None:
@@ -144,23 +136,13 @@ class Locator:
         return self._places[0].copy() if stamp - self._since > _PATIENCE_S * 1e9 else None
 
 
-def go_on(session: Session, saved: Saved, place: np.ndarray, stamp: int, *, fixed: bool) -> None:
-    """Lets a new session start from a saved run.
-
-    Args:
-      place: (2,) where the robot is now [m].
-      stamp: of the moment [ns].
-      fixed: map and beacons stay as they are.
-    """
+def resumed(saved: Saved, place: np.ndarray, *, fixed: bool) -> State:
+    """The saved state with the robot at a place (2,) [m]; fixed: beacons and map are not to change."""
     state = jax.tree.map(jnp.asarray, saved.state)
     for slot in np.flatnonzero(np.asarray(state.moving)):
         state = state_edits.remove(state, int(slot))  # where it has been carried since, nobody knows
     state = state_edits.put_robot(state, place)
-    if fixed:
-        state = _pinned(state)
-    session.fixed = fixed
-    session.go_on(state, saved.tiles.copy(), saved.slots, saved.found_bias, stamp)
-    session.history.event(stamp, EventKind.LOCALISING if fixed else EventKind.RESUMED)
+    return _pinned(state) if fixed else state
 
 
 def _pinned(state: State) -> State:

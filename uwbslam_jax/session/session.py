@@ -29,11 +29,14 @@ from uwbslam_jax.backend import (
     take_over,
 )
 from uwbslam_jax.beacons import MEMORY_S, BeaconKeeper
-from uwbslam_jax.estimator import Estimate, State, compiled, init, state_vector
+from uwbslam_jax.estimator import Estimate, compiled, init, state_vector
 from uwbslam_jax.mapping import Tiles, redraw
 from uwbslam_jax.measurements import StampedFrame
-from uwbslam_jax.result import BeaconStatus, EventKind, RunStatus
+from uwbslam_jax.result import BeaconStatus, EventKind, MapImage, RunStatus
+from uwbslam_jax.session import saved_state
 from uwbslam_jax.session.history import History
+from uwbslam_jax.session.saved_state import Saved
+from uwbslam_jax.session.update import Update
 from uwbslam_jax.settings import Params, Settings, make_config, make_params
 from uwbslam_jax.startup import Buffer, adopt, decide
 
@@ -68,7 +71,7 @@ class Session:
       history: what was reported so far.
       graph: what the run as a whole is solved from. hindsight: its solution once the run is over, else None.
       taken_over: how often the state was corrected by the run so far, solved as a whole.
-      listener: called with each frame and its estimate when stepped frame by frame, before the host has its look.
+      listener: called with each update when stepped frame by frame, before the host has its look.
       fixed: whether map and beacons are taken as they are: the run only localises.
     """
 
@@ -84,7 +87,7 @@ class Session:
         self.status = RunStatus.LIDAR_ONLY if settings.filter.lidar_only else RunStatus.WAITING
         self.hypotheses = 0
         self.found_bias: dict[int, float] = {}
-        self.listener: Callable[[StampedFrame, Estimate], object] | None = None
+        self.listener: Callable[[Update], object] | None = None
         self.fixed = False
         self._slots: dict[int, int] = {settings.robot.id: 0}
         self._pending: list[tuple[StampedFrame, Estimate]] = []
@@ -130,7 +133,7 @@ class Session:
         self._learn_slots(frame)
         self.state, (estimate,) = compiled.step(self.config, self.params, self.state, [frame.frame])
         if self.listener is not None:
-            self.listener(frame, estimate)
+            self.listener(self.update(frame, estimate))
         self._take(frame, estimate)
         return estimate
 
@@ -144,11 +147,35 @@ class Session:
             self._take(frame, estimate)
         return estimates
 
-    def go_on(
-        self, state: State, tiles: Tiles, slots: dict[int, int], found_bias: dict[int, float], stamp: int
-    ) -> None:
-        """Start from what an earlier run has found, at a stamp [ns], in place of start-up."""
-        self.state, self.tiles, self._slots, self.found_bias = state, tiles, dict(slots), dict(found_bias)
+    def update(self, frame: StampedFrame, estimate: Estimate) -> Update:
+        """A step as it is published."""
+        ids = self.ids
+        states = {slot: self._keeper.status(slot) for slot in ids}
+        return Update(frame, estimate, ids, states, self.status, self.decided_at is not None)
+
+    def map(self) -> MapImage:
+        """The map so far."""
+        return self.tiles.image(self.state.grid)
+
+    def saved(self) -> Saved | None:
+        """A copy of what was found, to go on from; None before the frame is decided, or where the run only localises."""
+        known = self.decided_at is not None or self.settings.filter.lidar_only
+        if self.fixed or not known:
+            return None
+        state = jax.tree.map(lambda leaf: np.array(leaf, copy=True), self.state)
+        return Saved(state, self.tiles.copy(), dict(self._slots), dict(self.found_bias))
+
+    def go_on(self, saved: Saved, place: np.ndarray, stamp: int, *, fixed: bool) -> None:
+        """Start from what an earlier run has found, in place of start-up.
+
+        Args:
+          place: (2,) where the robot is now [m]. stamp: of the moment [ns].
+          fixed: map and beacons stay as they are.
+        """
+        state = saved_state.resumed(saved, place, fixed=fixed)
+        self.state, self.tiles, self._slots = state, saved.tiles.copy(), dict(saved.slots)
+        self.found_bias, self.fixed = dict(saved.found_bias), fixed
+        self.history.event(stamp, EventKind.LOCALISING if fixed else EventKind.RESUMED)
         self.config = make_config(self.settings)
         self.params = self._biased(make_params(self.settings, self._slots))
         self.decided_at = stamp

@@ -9,18 +9,16 @@ import html
 import json
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import jax
 import numpy as np
 
-from uwbslam_jax.estimator import Estimate
 from uwbslam_jax.mapping import Grid, Tiles
-from uwbslam_jax.measurements import StampedFrame
-from uwbslam_jax.result import BeaconEstimate, BeaconStatus, Event as RunEvent, RunStatus
-from uwbslam_jax.session import Session
+from uwbslam_jax.result import Event as RunEvent, RunStatus
+from uwbslam_jax.session import Session, Update
 from uwbslam_jax.web import page
 from uwbslam_jax.web.page_data import extent, numbers, picture
 
@@ -62,17 +60,12 @@ class Status:
 
 @dataclass(frozen=True)
 class _Now:
-    """One step, as the loop left it."""
+    """One step, as the loop left it: t since the first scan [s]; links, with when they were last ranged [s]."""
 
     t: float
-    frame: StampedFrame
-    estimate: Estimate
-    slots: dict[int, int]
-    states: dict[int, BeaconStatus]
-    status: RunStatus
-    decided: bool
+    update: Update
     events: list[RunEvent]
-    links: dict[tuple[int, int], tuple[float, float | None]]
+    links: Mapping[tuple[int, int], tuple[float, float | None]]
 
 
 class LivePage:
@@ -101,29 +94,26 @@ class LivePage:
         self._lock = threading.Lock()
         self._fresh = False
 
-    def step(self, session: Session, frame: StampedFrame, estimate: Estimate, status: Status) -> None:
+    def step(self, session: Session, update: Update, status: Status) -> None:
         """Takes in one step; called by the loop."""
         if self._start is None:
-            if not frame.frame.has_scan:
+            if update.score is None:
                 return  # time counts from the first scan, as in the report
-            self._start = frame.stamp
-        t = (frame.stamp - self._start) / 1e9
+            self._start = update.stamp
+        t = (update.stamp - self._start) / 1e9
         before = self._now
-        self._links |= _links(t, frame, estimate, session.ids)
+        self._links |= {pair: (t, residual) for pair, residual in update.links.items()}
         if len(session.history.events) != self._events:
             self._events = len(session.history.events)
             self._take_track(session)
         elif before is not None and t - before.t < STEP_S:
             return
         self._lidar = session.settings.robot.lidar
-        states = {slot: session.beacon_status(slot) for slot in session.slots.values() if slot}
-        events = session.history.events[-_EVENTS:]
-        decided = session.decided_at is not None
         links = {pair: told for pair, told in self._links.items() if told[0] > t - _LINK_S}
-        now = _Now(t, frame, estimate, session.slots, states, session.status, decided, events, links)
+        now = _Now(t, update, session.history.events[-_EVENTS:], links)
         with self._lock:
             self._now, self._status = now, status
-            self._track.append(_row(t, np.asarray(estimate.pose, float), np.asarray(estimate.pose_cov, float)))
+            self._track.append(_row(t, update.pose, update.cov))
             if len(self._track) > _TRACK:
                 del self._track[1:-1:2]
         if self.watched and time.monotonic() - self._map_at > MAP_S:
@@ -182,15 +172,13 @@ class LivePage:
         if seen is not None:
             image = seen[1].image(seen[0])
             drawn = picture(image)
-            spots = [np.asarray(now.estimate.pose[:2], float)[None], *(b.position[None] for b in _estimates(now))]
+            spots = [now.update.pose[None, :2], *(b.position[None] for b in now.update.beacons.values())]
             self._picture = {"map": drawn, "extent": extent(spots, drawn)}
             yield "map", _json(self._picture)
         if now is self._told:
             return
         self._told = now
-        pose = dict(
-            zip(_COLUMNS, _row(now.t, np.asarray(now.estimate.pose), np.asarray(now.estimate.pose_cov)), strict=True)
-        )
+        pose = dict(zip(_COLUMNS, _row(now.t, now.update.pose, now.update.cov), strict=True))
         shown = {"pose": pose, "scan": _scan(now, self._lidar), "links": _shown_links(now), "beacons": _beacons(now)}
         yield "step", _json(shown)
 
@@ -201,10 +189,10 @@ class LivePage:
         notices = [("warn", text) for text in status.troubles]
         if now is None:
             return "words", _json({"notices": page.notices([*notices, ("info", "Waiting for the first scan.")])})
-        if not now.decided and now.status in _HINTS:
-            notices.append(("warn", _HINTS[now.status]))
-        e = now.estimate
-        if bool(e.poor) and now.frame.frame.has_scan:
+        told = now.update
+        if not told.decided and told.status in _HINTS:
+            notices.append(("warn", _HINTS[told.status]))
+        if bool(told.estimate.poor) and told.score is not None:
             notices.append(("info", "The scan does not fit the map: it is not drawn."))
         begin = self._start or 0
         rows = [(f"{(event.stamp - begin) / 1e9:.1f}", event.text) for event in reversed(now.events)]
@@ -212,7 +200,7 @@ class LivePage:
             {
                 "notices": page.notices(notices),
                 "tiles": page.tiles(_figures(now, status)),
-                "beacon-words": page.beacon_table(_estimates(now)),
+                "beacon-words": page.beacon_table(list(told.beacons.values())),
                 "event-words": page.table(("Time [s]", "What happened"), rows, [0]),
             }
         )
@@ -228,49 +216,17 @@ def _row(t: float, pose: np.ndarray, cov: np.ndarray) -> tuple[float | None, ...
 
 
 def _scan(now: _Now, lidar: tuple[float, float, float]) -> list[list[float | None]]:
-    """The scan in the frame of the map; at this size motion during the scan does not show."""
-    scan = now.frame.frame.scan
-    beam = np.flatnonzero(scan.valid)[::2]
-    bearing = float(scan.angle_min) + float(scan.angle_increment) * beam + lidar[2]
-    reach, pose = np.asarray(scan.ranges, float)[beam], np.asarray(now.estimate.pose, float)
-    x, y = lidar[0] + reach * np.cos(bearing), lidar[1] + reach * np.sin(bearing)
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    points = np.stack([pose[0] + c * x - s * y, pose[1] + s * x + c * y], axis=-1)
-    flat = numbers(points, 2)
+    """Every other return of the scan in the frame of the map."""
+    flat = numbers(now.update.scan_points(lidar, every=2), 2)
     return [flat[k : k + 2] for k in range(0, len(flat), 2)]
-
-
-def _links(
-    t: float, frame: StampedFrame, estimate: Estimate, ids: dict[int, int]
-) -> dict[tuple[int, int], tuple[float, float | None]]:
-    """Time and measured less predicted range [m] of each pair of ids that ranged; None where the range was left out."""
-    r = frame.frame.ranges
-    valid = np.flatnonzero(np.asarray(r.valid) & np.asarray(estimate.active)[r.i] & np.asarray(estimate.active)[r.j])
-    found = {}
-    for k in valid.tolist():
-        a, b = sorted((ids[int(r.i[k])], ids[int(r.j[k])]))
-        found[a, b] = (t, float(estimate.innovation[k]) if estimate.weight[k] > 0 else None)
-    return found
 
 
 def _shown_links(now: _Now) -> list[list[float | None]]:
     return [[*pair, None if r is None else numbers(np.array(r), 3)[0]] for pair, (_, r) in sorted(now.links.items())]
 
 
-def _estimates(now: _Now) -> list[BeaconEstimate]:
-    """Every beacon heard; one that is not in the state has no place."""
-    e, nowhere = now.estimate, (np.full(2, np.nan), np.full((2, 2), np.nan))
-    found = []
-    for node, slot in sorted(now.slots.items()):
-        if slot:
-            known = bool(e.active[slot])
-            place = (np.asarray(e.beacons[slot], float), np.asarray(e.beacon_covs[slot], float)) if known else nowhere
-            found.append(BeaconEstimate(node, *place, now.states.get(slot, BeaconStatus.WAITING)))
-    return found
-
-
 def _beacons(now: _Now) -> list[dict[str, Any]]:
-    placed = [b for b in _estimates(now) if np.isfinite(b.position).all()]
+    placed = [b for b in now.update.beacons.values() if np.isfinite(b.position).all()]
     return [
         {
             "id": b.id,
@@ -286,15 +242,15 @@ def _beacons(now: _Now) -> list[dict[str, Any]]:
 def _figures(now: _Now, status: Status) -> list[tuple[str, str, str]]:
     """Headline figures."""
     median, worst = status.latency_ms or (None, None)
-    e = now.estimate
-    states = [b.status for b in _estimates(now)]
+    e = now.update.estimate
+    states = [b.status for b in now.update.beacons.values()]
     counts = ", ".join(f"{states.count(s)} {html.escape(s)}" for s in dict.fromkeys(states))
     speed = float(np.hypot(*np.asarray(e.velocity, float)))
     rates = [(name, page.figure(rate, "Hz", 1), "measurements a second") for name, rate in status.rates.items()]
     dropped = sum(status.dropped.values())
     reasons = ", ".join(f"{count} {html.escape(why)}" for why, count in sorted(status.dropped.items()))
     return [
-        ("Time", page.figure(now.t, "s", 1), html.escape(now.status)),
+        ("Time", page.figure(now.t, "s", 1), html.escape(now.update.status)),
         ("Beacons placed", str(int(np.sum(e.active)) - 1), counts),
         ("Speed", page.figure(speed, "m/s", 2), f"match score {page.figure(float(e.score), '', 2)}"),
         ("Arrival to pose", page.figure(median, "ms", 1), f"99 % {page.figure(worst, 'ms', 1)}"),
