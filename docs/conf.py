@@ -32,8 +32,9 @@ autodoc_typehints = "signature"
 autodoc_default_options = {"members": True}
 python_use_unqualified_type_names = True
 python_maximum_signature_line_length = 100
-# a record's fields are described once, in its docstring
-napoleon_use_ivar = True
+# one line of a docstring may describe several arguments or fields: they are listed as they stand
+napoleon_use_param = False
+napoleon_custom_sections = [("Attributes", "params_style")]
 
 html_theme = "furo"
 html_title = "uwbslam_jax"
