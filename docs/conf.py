@@ -53,6 +53,8 @@ _BESIDE = {
 
 def _as_plain_text(app, what, name, obj, options, lines: list[str]) -> None:
     lines[:] = [_MARKUP.sub(lambda m: m[1] or "\\" + m[2], line) for line in lines]
+    if what in ("attribute", "data"):
+        lines.insert(0, "\\")  # an empty first line: of a first line napoleon takes what precedes a colon for the type
 
 
 def _without_fields(app, what, name, obj, skip, options) -> bool | None:
