@@ -1,0 +1,61 @@
+"""The scripts of the documentation: short, shown, and they run on the tutorial's recording."""
+
+from __future__ import annotations
+
+import resource
+from pathlib import Path
+
+import pytest
+from reader import ROOT, Run
+
+SCRIPTS = ROOT / "docs" / "scripts"
+
+MADE = {
+    "make_arrays": ["arrays.npz"],
+    "first": ["out/trajectory.tum", "out/beacons.csv", "out/map.pgm", "out/report.html"],
+    "own_arrays": ["out/trajectory.tum", "out/beacons.csv", "out/map.pgm", "out/report.html"],
+    "gradient": [],
+    "compare": [],
+    "simulate": [],
+    "localize": ["saved/state.npz"],
+    "inspect_recording": [],
+    "tune": ["tuned.toml"],
+    "seeds": [],
+}
+"""Script -> the files that it writes. The first one only makes arrays for another."""
+
+GRADIENT_S = 60.0
+"""What the gradient may take, compilation included [s of CPU: others may use the machine at the same time]."""
+
+
+def test_every_script_is_listed_and_shown() -> None:
+    assert {path.stem for path in SCRIPTS.glob("*.py")} == set(MADE)
+    pages = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "docs").glob("*.md"))
+    assert [name for name in MADE if f"{{literalinclude}} scripts/{name}.py" not in pages] == []
+
+
+@pytest.mark.parametrize("name", MADE)
+def test_has_at_most_ten_lines_of_code(name: str) -> None:
+    lines = [line.strip() for line in (SCRIPTS / f"{name}.py").read_text(encoding="utf-8").splitlines()]
+    assert len([line for line in lines if line and not line.startswith("#")]) <= 10
+
+
+@pytest.mark.parametrize("name", MADE)
+def test_runs(name: str, folder: Path, run: Run) -> None:
+    if name == "own_arrays":
+        run("python", SCRIPTS / "make_arrays.py", cwd=folder)
+    before = _cpu_seconds()
+    done = run("python", SCRIPTS / f"{name}.py", cwd=folder)
+    assert [path for path in MADE[name] if not (folder / path).is_file()] == []
+    assert "nan" not in done.stdout.split()  # no figure is missing
+    assert done.stdout or MADE[name]
+    if name == "own_arrays":
+        assert "decided" in done.stdout  # the arrays are enough for a frame
+    if name == "gradient":
+        assert _cpu_seconds() - before < GRADIENT_S
+
+
+def _cpu_seconds() -> float:
+    """Of all processes that have ended so far [s]."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
