@@ -14,7 +14,7 @@ from uwbslam_jax.estimator import init, state_vector
 from uwbslam_jax.estimator.state import Estimate, State
 from uwbslam_jax.measurements import Frame, StampedFrame
 from uwbslam_jax.session.frame_assembler import pad_scan
-from uwbslam_jax.settings import Params, Settings, UwbSettings, make_config, make_params
+from uwbslam_jax.settings import Params, Settings, UwbSettings, make_config, make_host_params, make_params
 
 SETTINGS = Settings(uwb=UwbSettings(max_beacons=3, sigma_n=0.1))
 CONFIG = make_config(SETTINGS)
@@ -54,7 +54,7 @@ class World:
         params: Params | None = None,
         seed: int = 0,
     ):
-        self.keeper, self.state = BeaconKeeper(SETTINGS), state
+        self.keeper, self.state = BeaconKeeper(), state
         self.walk = np.zeros((4, 2))
         self._pairs = pairs
         self.params = make_params(SETTINGS) if params is None else params
@@ -111,7 +111,7 @@ class World:
         return StampedFrame(round(self.time * SECOND), frame), Estimate._make({**empty, **known}.values())
 
     def _look(self, pending) -> None:
-        self.state, events = self.keeper.look(self.state, self.params, pending)
+        self.state, events = self.keeper.look(self.state, make_host_params(SETTINGS, self.params), pending)
         self.events += [(self.time, slot, text) for slot, text in events]
 
     def position(self, slot: int) -> np.ndarray:

@@ -31,7 +31,7 @@ from uwbslam_jax.beacons.range_table import Heard, heard
 from uwbslam_jax.estimator import Estimate, State, ranging
 from uwbslam_jax.measurements import StampedFrame
 from uwbslam_jax.numerics import locate
-from uwbslam_jax.settings import Params, Settings
+from uwbslam_jax.settings import HostParams
 
 _SILENT_S = 3.0
 _DROP_S = 60.0
@@ -95,9 +95,7 @@ class _Copied:
 class BeaconKeeper:
     """Life of all beacons; see the module's first lines."""
 
-    def __init__(self, settings: Settings):
-        self._nlos_gap_db = settings.uwb.nlos_gap_db
-        self._sigma_n = settings.uwb.sigma_n
+    def __init__(self) -> None:
         self._lives: dict[int, _Life] = {}
         self._start: int | None = None
         self._copied: _Copied | None = None
@@ -120,14 +118,14 @@ class BeaconKeeper:
         return (stamp - self._start) / 1e9
 
     def look(
-        self, state: State, params: Params, pending: list[tuple[StampedFrame, Estimate]]
+        self, state: State, host: HostParams, pending: list[tuple[StampedFrame, Estimate]]
     ) -> tuple[State, list[Event]]:
         """The state after what a few frames told about the beacons, and what happened to which slot."""
         self._seconds(pending[0][0].stamp)  # time counts from the first frame
-        self._listen(heard(pending, params))
+        self._listen(heard(pending, host))
         span = self._seconds(pending[-1][0].stamp) - self._seconds(pending[0][0].stamp)
         now = self._seconds(pending[-1][0].stamp)
-        share, found = self._find_carried_robot(state, self._known(state, now, 0))
+        share, found = self._find_carried_robot(state, self._known(state, host.sigma_n, now, 0))
         believed = self._believes(found, share, now, [e for frame, e in pending if frame.frame.has_scan])
         if found is not None and believed:
             for life in self._lives.values():
@@ -135,7 +133,7 @@ class BeaconKeeper:
             return state_edits.put_robot(state, found), [(0, "was carried: found again by its ranges")]
         events: list[Event] = []
         for slot, life in sorted(self._lives.items()):
-            known = self._known(state, now, slot)
+            known = self._known(state, host.sigma_n, now, slot)
             if life.status in ("waiting", "dropped"):
                 state = self._try_to_place(state, known, slot, life, events)
             elif life.status == "moving":
@@ -146,13 +144,13 @@ class BeaconKeeper:
             life.sightings.forget(before=now - (_WATCHED_S if trusted else MEMORY_S))
         return state, events
 
-    def _known(self, state: State, now: float, slot: int) -> Known:
+    def _known(self, state: State, sigma_n: float, now: float, slot: int) -> Known:
         if self._copied is None or self._copied.of is not state:
-            self._copied = _Copied(state, self._sigma_n)
+            self._copied = _Copied(state, sigma_n)
         trusted = self._copied.rests.copy()
         trusted[self._doubted()] = False
         noise = self._copied.noise[slot]
-        return Known(self._copied.places, self._copied.variance, trusted, self._sigma_n, noise, now)
+        return Known(self._copied.places, self._copied.variance, trusted, sigma_n, noise, now)
 
     def _doubted(self) -> list[int]:
         return [slot for slot, life in self._lives.items() if life.doubted is not None]
@@ -171,8 +169,6 @@ class BeaconKeeper:
 
     def _listen(self, ranges: Heard) -> None:
         """Remember each usable range to a node of known place."""
-        kept = ~(ranges.power_gap > self._nlos_gap_db)
-        ranges = ranges._replace(**{name: column[kept] for name, column in ranges._asdict().items()})
         time = (ranges.stamp - (self._start or 0)) / 1e9
         columns = [time + ranges.age, ranges.i, *ranges.antenna.T, ranges.flat, ranges.normalised]
         for node, other, usable in ((ranges.i, ranges.j, ranges.rests_j), (ranges.j, ranges.i, ranges.rests_i)):
@@ -293,8 +289,8 @@ class BeaconKeeper:
             return share, None
         anchors, distance = np.concatenate(rows)[:, :2], np.concatenate(rows)[:, 2]
         # the newest ranges were taken on the move: a few decimetres are as good as they get
-        found = locate(anchors, distance, np.full(len(distance), 2 * self._sigma_n))
+        found = locate(anchors, distance, np.full(len(distance), 2 * known.sigma_n))
         if found is None or np.linalg.norm(found[0] - known.places[0]) < _CARRIED_M:
             return share, None
         left = np.abs(np.linalg.norm(anchors - found[0], axis=1) - distance)
-        return share, found[0] if np.mean(left < _MISFIT * self._sigma_n) > _FOUND_SHARE else None
+        return share, found[0] if np.mean(left < _MISFIT * known.sigma_n) > _FOUND_SHARE else None

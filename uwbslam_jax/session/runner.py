@@ -108,7 +108,7 @@ class Runner:
         self._step_ms.extend([max(seconds, 0.0) * 1e3 / len(frames)] * len(frames))
         if self.session.status == "waiting for motion":
             for frame in frames:
-                self._links.hear(frame, self.session.params, self.session.config.nlos_gap_db)
+                self._links.hear(frame, self.session.host)
         return estimates
 
 

@@ -11,8 +11,6 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from uwbslam_jax.backend import (
@@ -20,7 +18,6 @@ from uwbslam_jax.backend import (
     Hindsight,
     Node,
     Question,
-    RangeMeans,
     Reviser,
     Revision,
     Solution,
@@ -33,7 +30,7 @@ from uwbslam_jax.estimator import Estimate, State, compiled, init, state_vector
 from uwbslam_jax.mapping import Tiles, redraw
 from uwbslam_jax.measurements import StampedFrame
 from uwbslam_jax.session.history import History
-from uwbslam_jax.settings import Params, Settings, make_config, make_params
+from uwbslam_jax.settings import HostParams, Params, Settings, make_config, make_host_params, make_params
 from uwbslam_jax.startup import Buffer, adopt, decide
 
 CONTROL_EVERY = compiled.GROUP
@@ -77,16 +74,23 @@ class Session:
         self._slots: dict[int, int] = {settings.robot.id: 0}
         self._pending: list[tuple[StampedFrame, Estimate]] = []
         self._solved_at = self._solved_with = 0
-        self._buffer = self._new_buffer()
-        self._keeper = BeaconKeeper(settings)
-        self.graph = Graph(RangeMeans(settings.uwb.sigma_n))
+        self._copied: tuple[Params | None, HostParams] = (None, make_host_params(settings, self.params))
+        self._buffer = Buffer(self.host)
+        self._keeper = BeaconKeeper()
+        self.graph = Graph()
         self.hindsight: Hindsight | None = None
         self._looks_back = settings.filter.preset == "robust" and not settings.filter.lidar_only
         self._reviser = Reviser()
         self.taken_over = 0
         self._places: dict[Node, np.ndarray] = {}
         self._frame_nodes: tuple[Node, Node] = ((0, 0), (0, 0))
-        self._copied: tuple[Params | None, Params] = (None, self.params)
+
+    @property
+    def host(self) -> HostParams:
+        """What the host takes ranges for: of the parameters that are in use now."""
+        if self._copied[0] is not self.params:
+            self._copied = (self.params, make_host_params(self.settings, self.params))
+        return self._copied[1]
 
     @property
     def slots(self) -> dict[int, int]:
@@ -133,7 +137,7 @@ class Session:
         """Start from what an earlier run has found, at a stamp [ns], in place of start-up."""
         self.state, self.tiles, self._slots, self.found_bias = state, tiles, dict(slots), dict(found_bias)
         self.config = make_config(self.settings)
-        self.params = self._biased(make_params(self.settings, self._slots))
+        self.params = make_params(self.settings, self._slots, self.found_bias)
         self.decided_at = stamp
         self._looks_back = False  # the scans that the saved map was drawn from are gone
         self.status, self.hypotheses = "decided", 1
@@ -165,33 +169,19 @@ class Session:
             self.graph.ranges.node(slot): positions[slot] for slot in map(int, np.flatnonzero(resting)) if slot > 0
         }
         poses = self.history.poses[self.graph.keyframes["frame"]].astype(float)
-        configured = make_params(self.settings, self._slots)
+        configured = make_host_params(self.settings, make_params(self.settings, self._slots))
         return Question(self.graph, poses, places, configured, self._frame_nodes, bool(self.found_bias))
 
     def _learn_slots(self, frame: StampedFrame) -> None:
         if len(frame.slots) > len(self._slots):
             self._slots = dict(frame.slots)
-            self.params = self._biased(make_params(self.settings, self._slots))
-            self._buffer.height, self._buffer.bias = np.asarray(self.params.height), np.asarray(self.params.bias)
-
-    def _biased(self, params: Params) -> Params:
-        """Parameters with the biases that were found added to the configured ones."""
-        bias = np.array(params.bias)
-        for slot, found in self.found_bias.items():
-            bias[slot] += found
-        return params._replace(bias=jnp.asarray(bias, jnp.float32))
-
-    def _new_buffer(self) -> Buffer:
-        p = self.params
-        antenna, height, bias = np.asarray(p.antenna, float), np.asarray(p.height), np.asarray(p.bias)
-        return Buffer(antenna, height, bias, float(p.sigma_n), float(p.bias_scale))
+            self.params = make_params(self.settings, self._slots, self.found_bias)
+            self._buffer.host = self.host
 
     def _take(self, frame: StampedFrame, estimate: Estimate) -> None:
         if self._looks_back:
             # not with the look: what that takes comes on top for one frame in ten
-            self.graph.add(
-                self.config, self._params_on_host(), len(self.history.stamps) + len(self._pending), frame, estimate
-            )
+            self.graph.add(self.host, len(self.history.stamps) + len(self._pending), frame, estimate)
         self._pending.append((frame, estimate))
         if len(self._pending) == CONTROL_EVERY:
             self._look()
@@ -211,7 +201,7 @@ class Session:
 
     def _start_up(self, pending: list[tuple[StampedFrame, Estimate]]) -> None:
         for frame, estimate in pending:
-            self._buffer.add(frame, estimate, decide.usable(frame.frame.ranges, self.config.nlos_gap_db))
+            self._buffer.add(frame, estimate)
         now = pending[-1][0].stamp
         if now - self._solved_at < _SOLVE_EVERY_S * 1e9 or self._buffer.newest == self._solved_with:
             return  # nothing can have been learnt but better averages
@@ -227,7 +217,7 @@ class Session:
         if outcome.biased:
             nodes = [0, *outcome.placement.slots]
             self.found_bias = dict(zip(nodes, map(float, outcome.placement.bias), strict=True))
-            self.params = self._biased(make_params(self.settings, self._slots))
+            self.params = make_params(self.settings, self._slots, self.found_bias)
         adopted = adopt(
             self.config, self.params, self.state, self.tiles, self._buffer, outcome.placement, (origin, along)
         )
@@ -240,12 +230,11 @@ class Session:
         for slot in outcome.placement.slots:
             self._keeper.placed(slot, now)
             self.history.event(now, f"beacon {ids[slot]} placed")
-        self._buffer = self._new_buffer()
+        self._buffer = Buffer(self.host)
 
     def _keep_beacons(self, pending: list[tuple[StampedFrame, Estimate]]) -> None:
         ids = {slot: node for node, slot in self._slots.items()}
-        params = self._params_on_host()
-        self.state, events = self._keeper.look(self.state, params, pending)
+        self.state, events = self._keeper.look(self.state, self.host, pending)
         for slot, text in events:
             who = "robot" if slot == 0 else f"beacon {ids[slot]}"
             self.history.event(pending[-1][0].stamp, f"{who} {text}")
@@ -253,11 +242,6 @@ class Session:
         if any(slot == 0 for slot, _ in events):
             self._reviser.drop()
         self._revise(pending[-1][0].stamp)
-
-    def _params_on_host(self) -> Params:
-        if self._copied[0] is not self.params:
-            self._copied = (self.params, jax.device_get(self.params))
-        return self._copied[1]
 
     def _remember(self, slot: int, text: str, now: int) -> None:
         """What an event means for the run as a whole."""
@@ -298,7 +282,7 @@ class Session:
         self.found_bias = solution.bias
         if self.biased and not told:
             self.history.event(now, "ranges are biased: biases and beacons solved from the run so far")
-        self.params = self._biased(make_params(self.settings, self._slots))
+        self.params = make_params(self.settings, self._slots, self.found_bias)
 
     def beacon_status(self, slot: int) -> str:
         """static, moving, silent, dropped or waiting."""
