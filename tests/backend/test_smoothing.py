@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 
 from uwbslam_jax.backend import smoothing
 from uwbslam_jax.backend.graph import Graph
-from uwbslam_jax.backend.range_means import RangeMeans
 from uwbslam_jax.numerics import sparse_least_squares
 from uwbslam_jax.numerics.se2_host import between
+from uwbslam_jax.settings import HostParams, Settings, UwbSettings, make_host_params, make_params
 
 BEACONS = {1: np.array([-3.0, 5.0]), 2: np.array([9.0, 6.0]), 3: np.array([8.0, -4.0]), 4: np.array([-2.0, -3.0])}
 SIGMA_N = 0.1
 ANTENNA = np.array([0.1, -0.05])
 K = 5
+SETTINGS = Settings(uwb=UwbSettings(max_beacons=K - 1, sigma_n=SIGMA_N))
 
 
 def loop(count: int = 80) -> np.ndarray:
@@ -39,7 +41,7 @@ def make(truth: np.ndarray, seed: int = 0, bias=None, sight: np.ndarray | None =
     bias = bias or dict.fromkeys(range(K), 0.0)
     information = np.diag([0.005**-2, 0.005**-2, 0.001**-2]) if sight is None else sight
     drift = np.cumsum(rng.normal(0, [0.01, 0.01, 0.002], truth.shape), axis=0)
-    graph = Graph(RangeMeans(SIGMA_N))
+    graph = Graph()
     for k, pose in enumerate(truth + drift):
         graph.keyframes.append((k * 400_000_000, k, pose, information, np.zeros(2), 0.0, np.full(3, np.nan), False))
         graph.scans.append(None)
@@ -64,11 +66,16 @@ def make(truth: np.ndarray, seed: int = 0, bias=None, sight: np.ndarray | None =
     return graph
 
 
+def host(**changes) -> HostParams:
+    """Ranges without biases between antennas of one height, but for what is given."""
+    made = make_host_params(SETTINGS, make_params(SETTINGS))
+    return replace(made, antenna=ANTENNA, **changes)
+
+
 def solved(graph: Graph, **changes) -> smoothing.Solution:
     rng = np.random.default_rng(99)
     places = {(slot, 0): spot + rng.normal(0, 0.2, 2) for slot, spot in BEACONS.items()}
-    arguments = {"height": np.zeros(K), "bias": np.zeros(K), "bias_scale": 0.0} | changes
-    found = smoothing.solve(graph, graph.poses(), places, **arguments)
+    found = smoothing.solve(graph, graph.poses(), places, host(**changes))
     assert found is not None
     return found
 
@@ -169,10 +176,9 @@ def test_where_scans_are_blind_ranges_and_an_even_drive_tell_the_way() -> None:
 def test_too_little_gives_nothing() -> None:
     graph = make(loop(60))
     places = {(slot, 0): spot for slot, spot in BEACONS.items()}
-    empty = Graph(RangeMeans(SIGMA_N))
-    zeros = np.zeros(K)
-    assert smoothing.solve(empty, empty.poses(), places, zeros, zeros, 0.0) is None
-    assert smoothing.solve(graph, graph.poses(), {}, zeros, zeros, 0.0) is None
+    empty = Graph()
+    assert smoothing.solve(empty, empty.poses(), places, host()) is None
+    assert smoothing.solve(graph, graph.poses(), {}, host()) is None
 
 
 def test_derivatives_agree_with_differences() -> None:
@@ -180,9 +186,8 @@ def test_derivatives_agree_with_differences() -> None:
     graph = make(truth, sight=np.diag([0.2**-2, 0.02**-2, 0.004**-2]))
     graph.keyframes["informed"][:] = 0.0  # blind: the even drive counts
     places = {(slot, 0): spot for slot, spot in BEACONS.items()}
-    problem = smoothing.Problem.build(
-        graph, graph.poses(), places, np.array([0.0, 1.0, 0.5, 0.0, 2.0]), np.zeros(K), 0.02
-    )
+    ranging = host(height=np.array([0.0, 1.0, 0.5, 0.0, 2.0]), bias_scale=0.02)
+    problem = smoothing.Problem.build(graph, graph.poses(), places, ranging)
     rng = np.random.default_rng(3)
     x = problem.start(graph.poses() + rng.normal(0, 0.05, truth.shape), places)
     x[-5:] += rng.normal(0, 0.05, 5)
@@ -222,7 +227,7 @@ def test_normal_equations_are_those_of_the_rows(monkeypatch) -> None:
     truth = loop(40)
     graph = make(truth)
     places = {(slot, 0): spot for slot, spot in BEACONS.items()}
-    problem = smoothing.Problem.build(graph, graph.poses(), places, np.zeros(K), np.zeros(K), 0.0)
+    problem = smoothing.Problem.build(graph, graph.poses(), places, host())
     x = problem.start(graph.poses() + np.random.default_rng(5).normal(0, 0.05, truth.shape), places)
     fill = problem._rows(x[:3] + 1e-5, 0.3, (30.0, 2.0))
     J, r = stacked(fill, x)
@@ -242,7 +247,7 @@ def test_unknowns_are_eliminated_in_an_order_that_keeps_the_factor_sparse() -> N
     truth = np.tile(loop(40), (5, 1))
     graph = make(truth)
     places = {(slot, 0): spot for slot, spot in BEACONS.items()}
-    problem = smoothing.Problem.build(graph, graph.poses(), places, np.zeros(K), np.zeros(K), 0.0)
+    problem = smoothing.Problem.build(graph, graph.poses(), places, host())
     assert sorted(problem.rank) == list(range(problem.size))
 
     def entries(rank: np.ndarray) -> tuple[int, int]:

@@ -13,7 +13,7 @@ from start_of_run import BEACONS, IDS, SETTINGS
 from uwbslam_jax.estimator import init, state_vector
 from uwbslam_jax.mapping.tiled_map import Tiles
 from uwbslam_jax.numerics import se2, se2_host
-from uwbslam_jax.settings import make_config, make_params
+from uwbslam_jax.settings import make_config, make_host_params, make_params
 from uwbslam_jax.startup import adopt, decide
 
 TRUTH = np.array(list(BEACONS.values()))
@@ -30,7 +30,7 @@ def test_at_rest_it_waits_for_motion():
 
 
 def test_an_empty_buffer_waits_for_motion():
-    empty = decide.Buffer(np.zeros(2), np.zeros(4), np.zeros(4), 0.1)
+    empty = decide.Buffer(make_host_params(SETTINGS, PARAMS))
     assert decide.solve(empty, IDS).status == "waiting for motion"
 
 

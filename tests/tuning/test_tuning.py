@@ -10,13 +10,13 @@ import small_room as room
 from derivatives import assert_reverse, double, value_and_gradient
 from scipy.integrate import quad
 from test_slam import BEACONS, FLAT, PAIRS, PARAMS, knowing, room_map  # noqa: F401
-from test_smoothing import ANTENNA, BEACONS as SPOTS, K, loop, make, solved
+from test_smoothing import ANTENNA, BEACONS as SPOTS, K, host, loop, make, solved
 
 from uwbslam_jax.errors import ConfigError
 from uwbslam_jax.estimator import ranging
 from uwbslam_jax.files.settings_file import differences, from_dict
 from uwbslam_jax.numerics.se2_host import between, compose
-from uwbslam_jax.settings import Params, Settings
+from uwbslam_jax.settings import Settings
 from uwbslam_jax.tuning import calibration, fit, parameters, rollout
 from uwbslam_jax.tuning.likelihood import Objective, Score
 
@@ -211,12 +211,6 @@ def rotated(theta: float, v: np.ndarray) -> np.ndarray:
     return np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]]) @ v
 
 
-def params_of() -> Params:
-    return PARAMS._replace(
-        antenna=jnp.asarray(ANTENNA, jnp.float32), bias=jnp.zeros(K), height=jnp.zeros(K), lidar=jnp.zeros(3)
-    )
-
-
 MOUNTING = np.array([0.2, -0.1, 0.1])
 BIAS = {0: 0.1, 1: -0.15, 2: 0.05, 3: 0.2, 4: -0.1}
 ASKED = [*(f"bias.{slot}" for slot in BIAS), "lidar.x", "lidar.y", "lidar.yaw"]
@@ -227,7 +221,7 @@ def test_mounting_and_biases_are_found_or_told_as_not_observed(wheels):
     # a scan laid at X l has the robot at X l l0^-1, with l0 the origin
     graph = mounted(MOUNTING, BIAS, wheels=wheels)
     solution, slots = solved(graph), {slot: slot for slot in range(K)}
-    found, sigma, told = calibration.solve(graph, params_of(), solution, slots, ASKED, np.zeros(len(ASKED)))
+    found, sigma, told = calibration.solve(graph, host(), solution, slots, ASKED, np.zeros(len(ASKED)))
     assert len(SPOTS) == K - 1
     observed, error = np.array(told) == "", found - np.array([*BIAS.values(), *MOUNTING])
     assert observed[:K].sum() >= 3  # inside a ring of beacons some biases look like beacons farther off
