@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 import small_room as room
-from test_session import BEACONS, SETTINGS, Drive, assert_same_bits, pose_at
+from room_drive import BEACONS, SETTINGS, Drive, assert_same_bits, pose_at
 
 from uwbslam_jax.backend.final_solution import Question, _track
 from uwbslam_jax.backend.graph import KEYFRAME, Graph
@@ -149,7 +149,7 @@ def test_between_keyframes_a_direction_that_is_not_seen_is_even(finished) -> Non
         for k in frames[1:]:
             history.sight.values[k] = np.inf
             history.map_poses.values[k] += np.array([0.5, -0.5, 0.0])
-        track = _track(run.graph, history, poses)
+        track = _track(run.graph, poses, *history.passage())
         for k in frames[1:]:
             begin, end = run.graph.keyframes["stamp"][key : key + 2]
             share = (history.stamps[k] - begin) / (end - begin)

@@ -125,7 +125,7 @@ def test_adopted_state_is_the_start_in_the_published_frame():
     v, before = np.asarray(s.velocities[0]), np.array([0.3, 0.7])
     np.testing.assert_allclose(np.hypot(*v), np.hypot(*before), rtol=1e-6)
     turned = np.asarray(se2.rotation(-s.heading) @ s.velocities[0])
-    np.testing.assert_allclose(turned, decide.rotation(-pose[2]) @ before, atol=1e-5)
+    np.testing.assert_allclose(turned, se2_host.rotation_matrix(-pose[2]) @ before, atol=1e-5)
     assert float(s.yaw_rate) == float(state_vector.unpack(state.belief.mean).yaw_rate)
 
 
@@ -164,7 +164,7 @@ def test_covariance_of_the_velocity_turns_with_the_frame():
     _, _, _, adopted, pose = adopted_case()
     turn = float(state_vector.unpack(adopted.state.belief.mean).heading) - pose[2]
     J = np.eye(3)
-    J[:2, :2] = decide.rotation(turn)
+    J[:2, :2] = se2_host.rotation_matrix(turn)
     P = np.asarray(adopted.state.belief.cov)
     np.testing.assert_allclose(P[np.ix_(MOTION, MOTION)], J @ MOTION_COV @ J.T, atol=1e-6)  # float32
 

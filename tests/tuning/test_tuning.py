@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import small_room as room
 from derivatives import assert_reverse, double, value_and_gradient
+from known_room import BEACONS, FLAT, PAIRS, PARAMS, drawn_map, knowing
+from loop_graph import ANTENNA, BEACONS as SPOTS, K, host, loop, make, solved
 from scipy.integrate import quad
-from test_slam import BEACONS, FLAT, PAIRS, PARAMS, knowing, room_map  # noqa: F401
-from test_smoothing import ANTENNA, BEACONS as SPOTS, K, host, loop, make, solved
 
 from uwbslam_jax.errors import ConfigError
 from uwbslam_jax.estimator import ranging
@@ -37,7 +37,8 @@ def drive(count: int):
 
 
 @pytest.mark.usefixtures("x64")
-def test_gradient_through_fifty_steps_agrees_with_central_differences(room_map):  # noqa: F811
+def test_gradient_through_fifty_steps_agrees_with_central_differences():
+    room_map = drawn_map()
     finest = room_map._replace(levels=room_map.levels[:1])
     state, frames, params = double(knowing(finest, velocity=(0.3, 0.1))), double(drive(STEPS)), double(PARAMS)
 
@@ -65,7 +66,8 @@ def room_frames(count: int):
     return jax.tree.map(lambda leaf: jnp.zeros((count, *np.shape(leaf)), np.asarray(leaf).dtype), frame)
 
 
-def test_a_window_that_is_cut_out_sees_the_same_ground(room_map):  # noqa: F811
+def test_a_window_that_is_cut_out_sees_the_same_ground():
+    room_map = drawn_map()
     origin = np.asarray(room_map.origin, float) + np.array([12.8, -6.4])  # cells of 0.1 m: tiles of 6.4 m
     cut = rollout.cropped(room_map, 0.1, origin, 128)
     for old, new, shift in zip(room_map.levels, cut.levels, (64, 32), strict=True):
