@@ -12,7 +12,7 @@ import pytest
 from wheel_drive import BEACONS, SCALE, START, driven
 
 from uwbslam_jax.__main__ import main
-from uwbslam_jax.api import run_messages
+from uwbslam_jax.api import run
 from uwbslam_jax.files.mcap_log import LogWriter
 from uwbslam_jax.files.run_folder import read_run
 from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage
@@ -72,8 +72,8 @@ class TestAtRest:
 
     def test_an_unknown_common_offset_is_found_when_asked(self) -> None:
         settings = replace(SMALL, uwb=UwbSettings(fit_offset=True))
-        result, truth = run_messages(at_rest(), settings, online=True)
-        assert truth is None
+        result = run(at_rest(), settings, online=True)
+        assert result.truth is None
         assert result.summary["relative"]["offset_m"] == pytest.approx(2 * DELAY, abs=0.15)
         assert rms_after_fit({b.id: b.position for b in result.beacons}, NODES) < 0.12
 
@@ -81,7 +81,7 @@ class TestAtRest:
         robot = RobotSettings(id=31, antenna=(0.2, -0.1, 0.0))
         messages = [m for m in at_rest() if isinstance(m, RangeMessage)]
         messages = [replace(m, range=m.range - 2 * DELAY) for m in messages]
-        result, _ = run_messages(messages, replace(SMALL, robot=robot), online=True)
+        result = run(messages, replace(SMALL, robot=robot), online=True)
         beacons = {b.id: b.position for b in result.beacons}
         assert sorted(beacons) == sorted(set(NODES) - {31})
         for node, position in beacons.items():
@@ -115,7 +115,7 @@ class TestWheelsAndRanges:
         configured = replace(SMALL, uwb=UwbSettings(bias_scale=SCALE))
         beacons = []
         for settings in (SMALL, configured):
-            result, _ = run_messages(driven(), settings, online=True)
+            result = run(driven(), settings, online=True)
             beacons.append({b.id: b.position for b in result.beacons})
         plain, mended = (np.linalg.norm(found[5] - found[13]) for found in beacons)
         true = np.hypot(*np.subtract(BEACONS[5], BEACONS[13]))
@@ -124,8 +124,8 @@ class TestWheelsAndRanges:
 
     def test_wheels_alone_are_dead_reckoning(self) -> None:
         wheels = [m for m in driven(10.0) if isinstance(m, OdometryMessage)]
-        result, truth = run_messages(wheels, SMALL, online=True)
-        assert truth is None
+        result = run(wheels, SMALL, online=True)
+        assert result.truth is None
         assert len(result.stamps) == 100
         assert not result.beacons
         travelled = np.linalg.norm(result.poses[-1, :2] - result.poses[0, :2])
