@@ -11,7 +11,7 @@ import numpy as np
 
 from uwbslam_jax.estimator import Estimate, map_pose, sight
 from uwbslam_jax.measurements import StampedFrame
-from uwbslam_jax.numerics import Column, carried_along
+from uwbslam_jax.numerics import Column, carried_along, rotation_matrix
 from uwbslam_jax.startup import Adopted
 
 _RESIDUALS_EVERY_S = 1.0
@@ -160,6 +160,5 @@ class History:
         self.poses.values[:] = adopted.republish(self.stamps.values, self.poses.values)
         self.map_poses.values[:] = adopted.republish(self.stamps.values, self.map_poses.values)
         self.sight.values[:] += adopted.turn
-        c, s = np.cos(adopted.turn), np.sin(adopted.turn)
-        R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+        R = rotation_matrix(adopted.turn, 3)
         self.covs.values[:] = R @ self.covs.values @ R.T

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from uwbslam_jax import __version__
+from uwbslam_jax.numerics import turned
 from uwbslam_jax.result import BeaconEstimate, Result
 from uwbslam_jax.session.history import History
 from uwbslam_jax.session.session import Session
@@ -179,12 +180,9 @@ def _scan_points(session: Session) -> np.ndarray:
     # the estimate may be older than the published frame: its velocity counts relative to its own heading
     track = session.history.poses if session.hindsight is None else session.hindsight.track
     pose, velocity = track[number], np.asarray(estimate.velocity, float)
-    turned = pose[2] - float(estimate.pose[2])
-    c, s = np.cos(turned), np.sin(turned)
-    drift = np.array([c * velocity[0] - s * velocity[1], s * velocity[0] + c * velocity[1]])
+    drift = turned(pose[2] - float(estimate.pose[2]), velocity)
     heading = pose[2] + float(estimate.yaw_rate) * age
-    c, s = np.cos(heading), np.sin(heading)
-    return pose[:2] + np.stack([c * x - s * y, s * x + c * y], axis=-1) + age[:, None] * drift
+    return pose[:2] + turned(heading, np.stack([x, y], axis=-1)) + age[:, None] * drift
 
 
 def _frame_beacons(session: Session) -> list[int]:

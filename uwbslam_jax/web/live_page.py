@@ -19,6 +19,7 @@ import numpy as np
 from uwbslam_jax.estimator import Estimate
 from uwbslam_jax.mapping import Grid, Tiles
 from uwbslam_jax.measurements import StampedFrame
+from uwbslam_jax.numerics import transformed
 from uwbslam_jax.result import BeaconEstimate
 from uwbslam_jax.session import Session
 from uwbslam_jax.web import page
@@ -233,10 +234,8 @@ def _scan(now: _Now, lidar: tuple[float, float, float]) -> list[list[float | Non
     beam = np.flatnonzero(scan.valid)[::2]
     bearing = float(scan.angle_min) + float(scan.angle_increment) * beam + lidar[2]
     reach, pose = np.asarray(scan.ranges, float)[beam], np.asarray(now.estimate.pose, float)
-    x, y = lidar[0] + reach * np.cos(bearing), lidar[1] + reach * np.sin(bearing)
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    points = np.stack([pose[0] + c * x - s * y, pose[1] + s * x + c * y], axis=-1)
-    flat = numbers(points, 2)
+    points = np.stack([lidar[0] + reach * np.cos(bearing), lidar[1] + reach * np.sin(bearing)], axis=-1)
+    flat = numbers(transformed(pose, points), 2)
     return [flat[k : k + 2] for k in range(0, len(flat), 2)]
 
 
