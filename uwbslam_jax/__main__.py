@@ -9,6 +9,7 @@ import difflib
 import os
 import sys
 from collections.abc import Sequence
+from types import ModuleType
 
 from uwbslam_jax import __version__
 from uwbslam_jax.errors import UwbslamError
@@ -51,18 +52,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return INTERRUPTED
 
 
-def _guarded(commands, words: list[str]) -> int:
+def _guarded(commands: ModuleType, words: list[str]) -> int:
     try:
         commands.call(words[0], words[1:])
     except BrokenPipeError:  # whoever reads our output has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (UwbslamError, OSError) as error:
-        return _fail(f"{error.filename}: {error.strerror}" if _names_file(error) else str(error))
+        named = isinstance(error, OSError) and error.filename is not None and error.strerror is not None
+        return _fail(f"{error.filename}: {error.strerror}" if named else str(error))
     return 0
-
-
-def _names_file(error: BaseException) -> bool:
-    return isinstance(error, OSError) and error.filename is not None and error.strerror is not None
 
 
 def _fail(text: str) -> int:

@@ -11,8 +11,9 @@ from benchmarks.metric import Metric
 from benchmarks.theory.bound_recursion import recursion
 from uwbslam_jax.api import run_messages
 from uwbslam_jax.estimator import match_fusion
-from uwbslam_jax.evaluation import align, wrap
+from uwbslam_jax.evaluation import align
 from uwbslam_jax.files.settings_file import from_dict
+from uwbslam_jax.numerics import wrapped
 from uwbslam_jax.settings import MapSettings
 from uwbslam_jax.sim import Scenario, make_scenario, settings_overrides, simulate
 from uwbslam_jax.sim.rays import strike
@@ -90,7 +91,7 @@ def _one(made: Scenario) -> list[float]:
     published = align(result.stamps[known], result.online[known], {}, truth)
     for motion, track, target in ((into, result.poses, true), (published, result.online[known], true[known])):
         apart = motion.poses(track) - target
-        found += [float(np.mean(np.sum(apart[:, :2] ** 2, axis=1))), float(np.mean(wrap(apart[:, 2]) ** 2))]
+        found += [float(np.mean(np.sum(apart[:, :2] ** 2, axis=1))), float(np.mean(wrapped(apart[:, 2]) ** 2))]
     return [*found, *_bound(made)]
 
 

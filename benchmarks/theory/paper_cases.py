@@ -9,7 +9,8 @@ import numpy as np
 
 from benchmarks.accuracy import intervals
 from benchmarks.accuracy.trials import Outcome, measure
-from uwbslam_jax.evaluation import rigid_fit, wrap
+from uwbslam_jax.evaluation import rigid_fit
+from uwbslam_jax.numerics import wrapped
 from uwbslam_jax.result import MapImage, Result
 from uwbslam_jax.settings import FilterSettings, Settings
 from uwbslam_jax.sim import Scenario, make_scenario
@@ -198,7 +199,7 @@ def _seen(outcome: Outcome, made: Scenario) -> Seen:
         walls=walls,
         counted=_heard(result, made.uwb.robot_id),
         alive=alive,
-        off=np.asarray(wrap(outcome.trial.poses[:, 2] - outcome.trial.true[:, 2])),
+        off=np.asarray(wrapped(outcome.trial.poses[:, 2] - outcome.trial.true[:, 2])),
         score=np.asarray(result.diagnostics["match_score"]),
     )
 
