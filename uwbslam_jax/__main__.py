@@ -58,8 +58,9 @@ def _guarded(commands: ModuleType, words: list[str]) -> int:
     except BrokenPipeError:  # whoever reads our output has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (UwbslamError, OSError) as error:
-        named = isinstance(error, OSError) and error.filename is not None and error.strerror is not None
-        return _fail(f"{error.filename}: {error.strerror}" if named else str(error))
+        if isinstance(error, OSError) and error.filename is not None and error.strerror is not None:
+            return _fail(f"{error.filename}: {error.strerror}")
+        return _fail(str(error))
     return 0
 
 
