@@ -88,6 +88,7 @@ class TestHelp:
             assert all(f"--{section}.{key.replace('_', '-')}" in told for key in keys)
 
 
+@pytest.mark.slow
 def test_demo(tmp_path: Path) -> None:
     """The slow one: a process of its own, at full size."""
     words = [sys.executable, "-m", "uwbslam_jax", "demo", "--duration", "20", "-o", str(tmp_path / "out"), "--quiet"]
