@@ -8,7 +8,7 @@ from collections import Counter
 from uwbslam_drivers.device import Measured
 
 LONGEST = 1024
-"""A longer line is noise [bytes]: the longest of a radio, 32 ranges of a Makerfabs tag, has about 600."""
+"""A longer line is noise [bytes]: 32 ranges of a Makerfabs tag, the most a radio reports in one, take about 600."""
 
 
 class Lines:
