@@ -24,7 +24,7 @@ US, WRAP = 1000, (1 << 32) * 1000
 PRF_CONSTANT = {16: 113.77, 64: 121.74}
 """A of the power formulas by pulse repetition frequency [MHz -> dB] (DW1000 user manual, 4.7.1)."""
 _LINE = re.compile(rb"\$(UWB[DP]),(\d{1,10}),(\d{1,10}),(\d{1,10}),(-?\d{1,8}),([-0-9.,]*)\*([0-9A-Fa-f]{4})$")
-"""A line without its end [dimensionless]; what stands in its fields is checked after its CRC."""
+"""A line without its end [text]; what stands in its fields is checked after its CRC."""
 
 
 def checksum(text: bytes) -> int:

@@ -25,7 +25,7 @@ MS, WRAP = 1_000_000, (1 << 24) * 1_000_000
 LEAST_INTACT = 0.1
 """A scan with a smaller share of intact beams is dropped: too few are left to be matched [dimensionless]."""
 _HEAD = re.compile(rb"99b\n([0-o]{4})([0-o])\n")
-"""Status 99 with its sum, then the stamp with its own [dimensionless]: how each scan begins (SCIP 2.0, MD)."""
+"""Status 99 with its sum, then the stamp with its own [bytes]: how each scan begins (SCIP 2.0, MD)."""
 _SLACK = 66
 """A reply that has lost its end is taken for complete after so many bytes too many: a block, its sum and LF [bytes]."""
 _ATTEMPTS, _ANSWER = 8, 0.4

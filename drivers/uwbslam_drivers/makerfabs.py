@@ -18,9 +18,9 @@ from uwbslam_jax.measurements import NAN, RangeMessage
 _LINE = re.compile(
     r"AT\+RANGE=tid:(\d{1,5}),\s*mask:([0-9A-Fa-f]{1,8}),\s*seq:\s*(\d{1,5}),\s*range:\s*\(([^()]*)\)(.*)"
 )
-"""A report up to its ranges [dimensionless]; numbers are bounded, so that a damaged one stays small."""
+"""A report up to its ranges [text]; numbers are bounded, so that a damaged one stays small."""
 _RSSI, _ANCHORS = re.compile(r"rssi:\s*\(([^()]*)\)"), re.compile(r"ancid:\s*\(([^()]*)\)")
-"""Fields of a report [dimensionless]: powers and anchors may be missing, as older firmware leaves them out."""
+"""Fields of a report [text]: powers and anchors may be missing, as older firmware leaves them out."""
 
 
 class MakerfabsDecoder(LineDecoder):

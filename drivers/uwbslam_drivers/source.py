@@ -37,7 +37,7 @@ DEVICES: dict[str, Device] = {
     "dwm1001": Dwm1001(),
     "makerfabs": Makerfabs(),
 }
-"""Every protocol by name [dimensionless]; the first of a kind is its default."""
+"""Every protocol [name -> device]; the first of a kind is its default."""
 
 POLL = 0.1
 """A read waits no longer, so that closing is quick [s]."""

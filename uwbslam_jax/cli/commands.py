@@ -91,7 +91,7 @@ class EvaluateOptions:
 
 @dataclass
 class InspectOptions:
-    """Tell what a recording holds: topics, rates, gaps, nodes heard, and what is missing."""
+    """Show what a recording holds: topics, rates, gaps, nodes heard, and what is missing."""
 
     logs: Positional[tuple[Path, ...]]
     """MCAP recording, or a ROS 2 bag folder; several MCAP files are one recording."""
@@ -103,7 +103,7 @@ def call(name: str, words: Sequence[str]) -> None:
     """Runs one command with its own arguments.
 
     Raises:
-      UwbslamError, OSError: what a user can mend.
+      UwbslamError, OSError: what a user can repair.
       SystemExit: bad usage (status 2), or help was asked for (0); the text is printed.
     """
     options, run = _COMMANDS[name]
@@ -182,9 +182,7 @@ _COMMANDS: dict[str, tuple[Any, Callable[[Any], None]]] = {
     "live": (LiveOptions, live),
     "emulate": (EmulateOptions, emulate),
 }
-
-
-# What several commands share.
+"""Every command [name -> its options, what runs it]."""
 
 
 def _run_and_write(

@@ -1,4 +1,4 @@
-"""Settings in and out: reading TOML, checking ranges, writing TOML. What the settings are stands in `config`."""
+"""Settings in and out: reading TOML, checking ranges, writing TOML. What the settings are is in `settings`."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 from uwbslam_jax.errors import ConfigError
 from uwbslam_jax.settings import Settings
 
-_MAX_CELLS = 4096  # side of the finest level of the matching window; beyond this the maps alone take gigabytes
-
+_MAX_CELLS = 4096
+"""Side of the matching window at its finest level [cells]; beyond this the maps alone take gigabytes."""
 _POSITIVE = [
     *("uwb.sigma_n", "uwb.max_range", "lidar.max_range", "odom.sigma_floor", "map.resolution", "map.size_m"),
     *(
@@ -24,13 +24,14 @@ _POSITIVE = [
         "filter.sigma_w_yaw",
         "filter.sigma_w_beacon",
         "filter.sigma_w_carried",
-        "filter.sigma_l",
-        "filter.independent_beams",
     ),
-    *("filter.sigma_map", "filter.sigma_map_yaw"),
+    *("filter.sigma_l", "filter.independent_beams", "filter.sigma_map", "filter.sigma_map_yaw"),
 ]
+"""Settings that mean nothing at 0 [keys]: noises are divided by, and limits would leave no measurement."""
 _NOT_NEGATIVE = ["uwb.nlos_gap_db", "lidar.min_range", "odom.sigma_xy", "odom.sigma_yaw", "filter.gamma"]
-_MAY_BE_INFINITE = ["uwb.nlos_gap_db"]  # switches the rule off
+"""Settings that may be 0, which leaves out what they weigh [keys]."""
+_MAY_BE_INFINITE = ["uwb.nlos_gap_db"]
+"""Settings whose infinity switches their rule off [keys]."""
 _LIMITS = {
     "robot.id": (0, 2**32 - 1),
     "uwb.max_beacons": (1, 200),
@@ -38,6 +39,7 @@ _LIMITS = {
     "map.levels": (1, 5),
     "uwb.bias_scale": (-0.5, 1.0),
 }
+"""Least and greatest value of a setting [its unit]: ids have 32 bits; beyond the others lie mistakes."""
 
 
 def load_settings(path: Path | str) -> Settings:
@@ -100,7 +102,7 @@ def differences(settings: Settings) -> str:
 
 
 def save_settings(settings: Settings, path: Path | str) -> None:
-    """Writes what differs from the defaults as TOML; `load_settings` reads it back to equal settings. Raises OSError."""
+    """Writes what differs from the defaults as TOML, which `load_settings` reads back. Raises OSError."""
     Path(path).write_text(differences(settings), encoding="utf-8")
 
 

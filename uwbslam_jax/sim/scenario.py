@@ -1,6 +1,6 @@
 """The conditions of a simulation: world, path, beacons, devices and their faults, all in one Scenario.
 
-Nothing here measures or moves; `scenarios` has ready-made ones and `simulate` turns one into messages.
+Nothing here measures or moves; `catalogue` has ready-made ones and `simulate` turns one into messages.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from uwbslam_jax.sim.paths import Path
 from uwbslam_jax.sim.worlds import World
 
 INF = float("inf")
+"""No limit [s or m]."""
 Interval = tuple[float, float]
 """From, to [s since the start]."""
 

@@ -12,10 +12,9 @@ import numpy as np
 
 from uwbslam_jax.result import BeaconEstimate, MapImage, Result, crop
 
-# Embedded at most: what a screen can show and a file of a few megabytes holds.
 _POSES, _SAMPLES, _RESIDUALS, _PIXELS = 6000, 2000, 12_000, 2000
-
-# name -> label, unit; the order is that on the page.
+"""Most poses, values of a series, residuals, and pixels along the map [each]: a screen shows no more, and the file
+stays at a few megabytes."""
 _DIAGNOSTICS: dict[str, tuple[str, str]] = {
     "match_score": ("Match score", ""),
     "step_ms": ("Step time", "ms"),
@@ -24,6 +23,7 @@ _DIAGNOSTICS: dict[str, tuple[str, str]] = {
     "ranges_used": ("Ranges used", "a frame"),
     "searched": ("Wide searches", ""),
 }
+"""Label and unit of a series [name -> texts]; the order is that on the page."""
 
 
 def span(result: Result) -> float:

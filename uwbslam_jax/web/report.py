@@ -1,6 +1,6 @@
 """A run as one HTML page that opens offline: figures, map with a player, charts and tables.
 
-The page's frame is `page`, its data comes from report_data; here its words and tables are written.
+The page's frame is `page`, its data comes from `page_data`; here its words and tables are written.
 """
 
 from __future__ import annotations
@@ -18,9 +18,8 @@ from uwbslam_jax.result import BeaconStatus, Result, RunStatus
 from uwbslam_jax.web import page
 from uwbslam_jax.web.page_data import diagnostics, page_data, pair_kinds, pair_residuals, span
 
-_PAIRS = 60  # rows of the table of pairs
-
-# name -> label, unit, digits. What is not listed is shown all the same, under its own name.
+_PAIRS = 60
+"""Rows of the table of pairs [pairs]: more than the 45 of ten nodes, and still to be read."""
 _FIGURES: dict[str, tuple[str, str, int]] = {
     "steps": ("Steps", "", 0),
     "duration_s": ("Duration", "s", 1),
@@ -45,8 +44,11 @@ _FIGURES: dict[str, tuple[str, str, int]] = {
     "pose_nees_ratio": ("Pose NEES / dof", "", 2),
     "beacon_nees_ratio": ("Beacon NEES / dof", "", 2),
 }
-_UNITS = ("m", "s", "ms", "deg", "rad", "Hz")  # as the last part of a figure's name
+"""Label, unit and digits of a figure [name -> texts, number]; one that is not listed is shown under its own name."""
+_UNITS = ("m", "s", "ms", "deg", "rad", "Hz")
+"""Units that may be the last part of a figure's name [text], and are shown behind its value instead."""
 _SHOWN_APART = {"config", "warnings", "events", "dropped"}
+"""Parts of the summary that have sections of their own [keys]."""
 
 
 def write_report(
@@ -55,7 +57,7 @@ def write_report(
     """Writes the page.
 
     Args:
-      metrics: errors against the truth where there is one, see metrics.evaluate.
+      metrics: errors against the truth where there is one, see evaluation.evaluate.
       title: heading of the page, plain text.
 
     Shown from result.summary besides plain figures: `warnings` (a list of lines), `truncated` (a line or a flag),
@@ -115,8 +117,8 @@ def _notices(result: Result, metrics: Mapping[str, Any] | None) -> Iterator[tupl
     elif not result.beacons:
         yield "warn", "No beacon was placed."
     if summary.get("truncated"):
-        told = summary["truncated"]
-        yield "warn", told if isinstance(told, str) else "The recording breaks off; it was used up to there."
+        where = summary["truncated"]
+        yield "warn", where if isinstance(where, str) else "The recording breaks off; it was used up to there."
     for text in summary.get("warnings") or []:
         yield "warn", str(text)
     frames = np.diff(result.stamps) / 1e6

@@ -15,7 +15,7 @@ from uwbslam_jax.sim import Scenario
 PROCESSING = 1_000_000
 """A range is sent after this time: no radio answers at once [ns]."""
 TAG, ANCHOR = 2, 1
-"""Roles of LinkTrack [dimensionless] (NLink protocol)."""
+"""Roles of LinkTrack [one byte] (NLink protocol)."""
 
 
 class Radio:

@@ -62,7 +62,7 @@ EMULATORS: Mapping[str, Callable[[DeviceTime], EmulatedDevice]] = {
     "dwm1001": EmulatedDwm1001,
     "makerfabs": EmulatedMakerfabs,
 }
-"""Every emulated device by name [dimensionless]."""
+"""Every emulated device [name -> what makes one with its clock]."""
 
 
 class Server:
