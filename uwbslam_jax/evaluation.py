@@ -19,7 +19,7 @@ from uwbslam_jax.numerics import Column
 from uwbslam_jax.result import Result
 
 FIT_POSES, BEACON_WEIGHT = 400, 20.0
-"""The joint fit takes about 400 poses, evenly, and a beacon as 20 of them [poses]: five weigh a quarter of the track."""
+"""The joint fit takes about 400 poses, evenly, and a beacon as 20 of them [poses]: five weigh a quarter of it."""
 TRUTH = np.dtype([("stamp", np.int64), ("node", np.int64), ("pose", np.float64, 3)])
 """A message of the ground truth: stamp [ns], node's id or ROBOT, pose [m, m, rad]; a run of hours has very many."""
 ROBOT = -1

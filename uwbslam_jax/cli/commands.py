@@ -108,15 +108,10 @@ def call(name: str, words: Sequence[str]) -> None:
     """
     options, run = _COMMANDS[name]
     default = None
-    if options is RunOptions:
-        default = RunOptions((), Path(), settings=_settings_file(words))
-        default.logs = default.out = tyro.MISSING  # these two have to be given all the same
-    elif options is TuneOptions:
-        default = TuneOptions((), Path(), settings=_settings_file(words))
-        default.logs = default.out = tyro.MISSING
-    elif options is LiveOptions:
-        default = LiveOptions(Path(), settings=_settings_file(words))
-        default.out = tyro.MISSING
+    if options in (RunOptions, TuneOptions, LiveOptions):
+        fields = dataclasses.fields(options)
+        required = [f.name for f in fields if f.default is f.default_factory is dataclasses.MISSING]
+        default = options(**dict.fromkeys(required, tyro.MISSING), settings=_settings_file(words))
     run(tyro.cli(options, args=list(words), default=default, prog=f"uwbslam {name}", description=options.__doc__))
 
 

@@ -176,12 +176,7 @@ class LogWriter:
     """Writes measurements as a ROS 2 recording; a context manager that always finishes the file."""
 
     def __init__(
-        self,
-        path: str | Path,
-        *,
-        scan_topic: str = "/scan",
-        uwb_topic: str = "/uwb/ranges",
-        odom_topic: str = "/odom",
+        self, path: str | Path, *, scan_topic: str = "/scan", uwb_topic: str = "/uwb/ranges", odom_topic: str = "/odom"
     ):
         """Opens the file, replacing one that is there. Raises LogError."""
         self._records = RecordWriter(path)

@@ -60,12 +60,7 @@ def write_result_log(result: Result, path: str | Path) -> None:
     """
     known = np.flatnonzero(np.isfinite(result.poses).all(axis=1)) if len(result.stamps) else np.zeros(0, int)
     start = int(result.stamps[0]) if len(result.stamps) else 0
-    streams = [
-        _once(result, start, known),
-        _poses(result, known),
-        _beacons(result, start),
-        _diagnostics(result),
-    ]
+    streams = [_once(result, start, known), _poses(result, known), _beacons(result, start), _diagnostics(result)]
     channels: dict[str, int] = {}
     with RecordWriter(path, chunk_size=1 << 20) as records:
         for item in heapq.merge(*streams, key=lambda item: item.stamp):
@@ -268,11 +263,6 @@ def _status(stamp: int, diagnostics: dict[str, np.ndarray], index: int) -> Any:
         for name, series in diagnostics.items()
     ]
     status = build(
-        "diagnostic_msgs/msg/DiagnosticStatus",
-        level=0,
-        name="uwbslam",
-        message="",
-        hardware_id="",
-        values=values,
+        "diagnostic_msgs/msg/DiagnosticStatus", level=0, name="uwbslam", message="", hardware_id="", values=values
     )
     return build("diagnostic_msgs/msg/DiagnosticArray", header=header(stamp, ""), status=[status])

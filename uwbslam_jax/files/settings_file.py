@@ -118,12 +118,7 @@ def check(settings: Settings) -> Settings:
     Raises:
       ConfigError: one line that names the first key out of range, its value and what is allowed.
     """
-    flat: dict[str, Any] = {
-        f"{section.name}.{key.name}": getattr(getattr(settings, section.name), key.name)
-        for section in dataclasses.fields(settings)
-        for key in dataclasses.fields(getattr(settings, section.name))
-    }
-    for name, value in flat.items():
+    for name, value in _flat(settings).items():
         for number in _numbers(value):
             _check_number(name, number)
         if isinstance(value, dict):
@@ -136,6 +131,12 @@ def check(settings: Settings) -> Settings:
         raise ConfigError(f"filter.preset = {settings.filter.preset!r}: must be 'robust' or 'paper'")
     _check_together(settings)
     return settings
+
+
+def _flat(settings: Settings) -> dict[str, Any]:
+    """section.key -> value."""
+    sections = {section.name: getattr(settings, section.name) for section in dataclasses.fields(settings)}
+    return {f"{name}.{key}": value for name, section in sections.items() for key, value in vars(section).items()}
 
 
 def _check_number(name: str, number: float) -> None:
@@ -177,12 +178,7 @@ def _numbers(value: Any) -> list[float]:
 
 def _unknown(name: str) -> str:
     """Message for an unknown key or section that names the nearest known one."""
-    known = [
-        f"{section.name}.{key.name}"
-        for section in dataclasses.fields(Settings)
-        for key in dataclasses.fields(getattr(Settings(), section.name))
-    ]
-    sections = [section.name for section in dataclasses.fields(Settings)]
+    known, sections = list(_flat(Settings())), [section.name for section in dataclasses.fields(Settings)]
     section, _, key = name.rpartition(".")
     elsewhere = [other for other in known if other.split(".")[1] == key]
     within = [other for other in known if other.split(".")[0] == section]

@@ -178,7 +178,4 @@ def settings_overrides(scenario: Scenario) -> dict[str, Any]:
     """What a user would configure for this robot: lever arms and heights; never what is to be found out."""
     antenna, lidar = (tuple(float(x) for x in pose) for pose in (scenario.uwb.antenna, scenario.lidar.pose))
     heights = {str(b.id): float(b.height) for b in scenario.beacons if b.height != antenna[2]}
-    return {
-        "robot": {"id": scenario.uwb.robot_id, "antenna": antenna, "lidar": lidar},
-        "uwb": {"height": heights},
-    }
+    return {"robot": {"id": scenario.uwb.robot_id, "antenna": antenna, "lidar": lidar}, "uwb": {"height": heights}}

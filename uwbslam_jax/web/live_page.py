@@ -20,7 +20,7 @@ from uwbslam_jax.mapping import Grid, Tiles
 from uwbslam_jax.result import Event as RunEvent, RunStatus
 from uwbslam_jax.session import Session, Update
 from uwbslam_jax.web import page
-from uwbslam_jax.web.page_data import extent, numbers, picture
+from uwbslam_jax.web.page_data import beacon, extent, numbers, picture
 
 STEP_S = 0.1
 """Time between two steps that are shown: a scan's period, which looks continuous [s]."""
@@ -223,17 +223,7 @@ def _shown_links(now: _Now) -> list[list[float | None]]:
 
 
 def _beacons(now: _Now) -> list[dict[str, Any]]:
-    placed = [b for b in now.update.beacons.values() if np.isfinite(b.position).all()]
-    return [
-        {
-            "id": b.id,
-            "status": b.status,
-            **dict(zip("xy", numbers(b.position, 3), strict=True)),
-            "cov": numbers(np.array([b.cov[0, 0], b.cov[0, 1], b.cov[1, 1]]), 6),
-            "track": None,
-        }
-        for b in placed
-    ]
+    return [beacon(b, 3) for b in now.update.beacons.values() if np.isfinite(b.position).all()]
 
 
 def _figures(now: _Now, status: Status) -> list[tuple[str, str, str]]:

@@ -141,37 +141,24 @@ def _tiles(result: Result, metrics: Mapping[str, Any] | None) -> str:
     decided, when = _decided(result)
     at = f"{when:.1f} s" if isinstance(when, int | float) and not isinstance(when, bool) else "yes"
     states = Counter(beacon.status for beacon in result.beacons)
-    summary = {**dict.fromkeys(_FIGURES), **result.summary}
+    known = {**result.summary, **(metrics or {})}
+
+    def shown(name: str) -> str:
+        return page.figure(known.get(name), *_FIGURES[name][1:])
+
     tiles = []
     if metrics is not None:
-        m = {**dict.fromkeys(_FIGURES), **metrics}
         tiles += [
-            (
-                "Robot error, RMS",
-                page.figure(m["robot_rmse_m"], "m", 3),
-                f"largest {page.figure(m['robot_max_m'], 'm', 3)}",
-            ),
-            (
-                "Heading error, median",
-                page.figure(m["heading_deg_median"], "°", 2),
-                f"95 % {page.figure(m['heading_deg_p95'], '°', 2)}",
-            ),
-            (
-                "Beacon error, mean",
-                page.figure(m["beacon_mean_m"], "m", 3),
-                f"largest {page.figure(m['beacon_max_m'], 'm', 3)}",
-            ),
+            ("Robot error, RMS", shown("robot_rmse_m"), f"largest {shown('robot_max_m')}"),
+            ("Heading error, median", shown("heading_deg_median"), f"95 % {shown('heading_deg_p95')}"),
+            ("Beacon error, mean", shown("beacon_mean_m"), f"largest {shown('beacon_max_m')}"),
         ]
     tiles += [
         ("Beacons placed", str(len(result.beacons)), ", ".join(f"{n} {html.escape(s)}" for s, n in states.items())),
         ("Frame decided", html.escape(at) if decided else "not decided", "after the first scan" if at != "yes" else ""),
         ("Driven", page.figure(_driven(result), "m", 1), f"in {page.figure(span(result), 's', 1)}"),
-        (
-            "Step time, median",
-            page.figure(summary["step_ms_median"], "ms", 2),
-            f"95 % {page.figure(summary['step_ms_p95'], 'ms', 2)}",
-        ),
-        ("Real-time factor", page.figure(summary["real_time_factor"], "×", 1), "recorded time over computing time"),
+        ("Step time, median", shown("step_ms_median"), f"95 % {shown('step_ms_p95')}"),
+        ("Real-time factor", shown("real_time_factor"), "recorded time over computing time"),
     ]
     return page.tiles(tiles)
 
@@ -194,34 +181,27 @@ def _sections(result: Result, metrics: Mapping[str, Any] | None) -> str:
     events = [(f"{(event.stamp - start) / 1e9:.2f}", event.text) for event in result.events]
     dropped = summary.get("dropped") or {}
     plain = [_label(key, value) for key, value in summary.items() if key not in _SHOWN_APART]
-    pairs = []
+    none = '<p class="sub">None.</p>'
+    tables = []
     if metrics is not None:
         evaluation = [_label(key, value) for key, value in metrics.items()]
-        pairs.append(page.section("Errors against the truth", page.table((), evaluation, [1])))
-    pairs.append(page.section("Run", page.table((), plain, [1]) if plain else '<p class="sub">No summary.</p>'))
+        tables.append(page.section("Errors against the truth", page.table((), evaluation, [1])))
+    tables.append(page.section("Run", page.table((), plain, [1]) if plain else '<p class="sub">No summary.</p>'))
     counts = [(str(reason).replace("_", " "), page.text(count)) for reason, count in dropped.items()]
-    pairs.append(
-        page.section("Dropped measurements", page.table((), counts, [1]) if counts else '<p class="sub">None.</p>')
-    )
+    tables.append(page.section("Dropped measurements", page.table((), counts, [1]) if counts else none))
+    happened = f'<div class="tall">{page.table(("Time [s]", "What happened"), events, [0])}</div>'
     settings = summary.get("config")
     text = settings if isinstance(settings, str) else _nested(settings or {})
-    return "".join(
-        [
-            page.section("Beacons", page.beacon_table(result.beacons)),
-            _chart_section(result),
-            _residual_section(result),
-            page.section(
-                "Events",
-                f'<div class="tall">{page.table(("Time [s]", "What happened"), events, [0])}</div>'
-                if events
-                else '<p class="sub">None.</p>',
-            ),
-            f'<div class="two">{"".join(pairs)}</div>',
-            f"<section><details><summary>Configuration</summary><pre>{html.escape(text)}</pre></details></section>"
-            if text
-            else "",
-        ]
-    )
+    folded = f"<section><details><summary>Configuration</summary><pre>{html.escape(text)}</pre></details></section>"
+    sections = [
+        page.section("Beacons", page.beacon_table(result.beacons)),
+        _chart_section(result),
+        _residual_section(result),
+        page.section("Events", happened if events else none),
+        f'<div class="two">{"".join(tables)}</div>',
+        folded if text else "",
+    ]
+    return "".join(sections)
 
 
 def _nested(table: Mapping[str, Any], indent: str = "") -> str:
