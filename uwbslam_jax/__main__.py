@@ -1,6 +1,6 @@
 """The command line: finds the command, runs it, and turns what goes wrong into one line and an exit status.
 
-The commands are in `commands`; it is imported only once one is called, because JAX takes a second to load.
+The commands are in `cli.commands`; it is imported only once one is called, because JAX takes a second to load.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ COMMANDS = {
     "live": "run on LiDAR and UWB devices, with a view in the browser",
     "simulate": "write a recording of a ready-made scenario, with ground truth",
     "evaluate": "compare a run's folder with ground truth",
-    "inspect": "tell what a recording holds",
+    "inspect": "show what a recording holds",
     "emulate": "serve a simulated robot's sensors, to try live without hardware",
 }
-"""Name -> what it does, in a line."""
+"""What a command does, in a line [name -> text]."""
 
-BAD_INPUT = 2
-INTERRUPTED = 130
+BAD_INPUT, INTERRUPTED = 2, 130
+"""Exit statuses [number]: what most programs return for bad usage, and 128 + SIGINT, as a shell reports it."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -55,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _guarded(commands: ModuleType, words: list[str]) -> int:
     try:
         commands.call(words[0], words[1:])
-    except BrokenPipeError:  # whoever reads our output has seen enough
+    except BrokenPipeError:  # the reader of our output has closed it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (UwbslamError, OSError) as error:
         if isinstance(error, OSError) and error.filename is not None and error.strerror is not None:
@@ -73,7 +73,7 @@ def usage() -> str:
     """The help of the whole program."""
     lines = [f"  {name:<10} {about}" for name, about in COMMANDS.items()]
     head = "usage: uwbslam COMMAND ...\n\nSLAM from LiDAR scans and UWB ranges, without prior knowledge.\n"
-    return "\n".join([head, "commands:", *lines, "", "uwbslam COMMAND --help tells a command's options."])
+    return "\n".join([head, "commands:", *lines, "", "uwbslam COMMAND --help lists a command's options."])
 
 
 if __name__ == "__main__":

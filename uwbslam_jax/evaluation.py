@@ -14,20 +14,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from uwbslam_jax.measurements import TruthMessage
+from uwbslam_jax.measurements import NAN, TruthMessage
 from uwbslam_jax.numerics import Column, rigid_fit as fit_pose, rotation_matrix, wrapped
 from uwbslam_jax.result import Result
 
-NAN = float("nan")
-
-# The joint fit of robot and beacons: about this many poses, evenly, each beacon counting as much as this many poses.
-FIT_POSES = 400
-BEACON_WEIGHT = 20.0
-
-
+FIT_POSES, BEACON_WEIGHT = 400, 20.0
+"""The joint fit takes about 400 poses, evenly, and a beacon as 20 of them [poses]: five weigh a quarter of it."""
 TRUTH = np.dtype([("stamp", np.int64), ("node", np.int64), ("pose", np.float64, 3)])
 """A message of the ground truth: stamp [ns], node's id or ROBOT, pose [m, m, rad]; a run of hours has very many."""
 ROBOT = -1
+"""Stands for the robot among node ids [id], which are not negative."""
 
 
 def truth_row(message: TruthMessage) -> tuple[int, int, tuple[float, float, float]]:
