@@ -1,6 +1,13 @@
 """The compiled step: pure, of fixed shape, reads like the paper."""
 
-from uwbslam_jax.estimator import compiled as compiled, ranging as ranging, state_vector as state_vector
+from uwbslam_jax.estimator import (
+    compiled as compiled,
+    match_fusion as match_fusion,
+    matching as matching,
+    motion as motion,
+    ranging as ranging,
+    state_vector as state_vector,
+)
 from uwbslam_jax.estimator.compiled import CompileClock as CompileClock
 from uwbslam_jax.estimator.published_frame import (
     anchored as anchored,
@@ -15,3 +22,9 @@ from uwbslam_jax.estimator.state import (
     sight as sight,
 )
 from uwbslam_jax.estimator.step import step as step
+from uwbslam_jax.settings import (
+    Config as Config,
+    Params as Params,
+    make_config as make_config,
+    make_params as make_params,
+)

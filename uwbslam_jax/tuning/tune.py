@@ -47,6 +47,12 @@ class Tuned:
     noises: NoiseFit | None
     objective: Objective | None
 
+    @property
+    def values(self) -> dict[str, float]:
+        """Name -> what was found, of every parameter."""
+        parts = [part for part in (self.calibration, self.noises) if part is not None]
+        return {name: float(value) for part in parts for name, value in zip(part.names, part.values, strict=True)}
+
     def cuts(self) -> list[str]:
         """Why rollouts end before their recordings do."""
         pieces = [] if self.objective is None else self.objective.pieces
