@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 
 from uwbslam_jax.measurements import Frame, Odometry, Ranges, StampedFrame
 from uwbslam_jax.session.frame_assembler import pad_scan
-from uwbslam_jax.settings import Settings, UwbSettings
+from uwbslam_jax.settings import RobotSettings, Settings, UwbSettings, make_host_params, make_params
 from uwbslam_jax.startup.keyframe_buffer import Buffer, Keyframe, Sighting
 
 BEACONS = {1: np.array([-2.0, 4.0]), 2: np.array([6.0, 5.0]), 3: np.array([5.0, -3.0])}
 IDS = {0: 0, 1: 1, 2: 2, 3: 3}
-SETTINGS = Settings(uwb=UwbSettings(max_beacons=3))
-SIGMA_N = 0.1
+SETTINGS = Settings(uwb=UwbSettings(max_beacons=3, sigma_n=0.1))
+SIGMA_N = SETTINGS.uwb.sigma_n
 
 
 def straight(length: float = 6.0) -> np.ndarray:
@@ -58,7 +59,8 @@ def buffer(
     """
     rng = np.random.default_rng(seed)
     bias = {0: 0.0, **dict.fromkeys(beacons, 0.0)} if bias is None else bias
-    kept = Buffer(np.array(antenna), np.zeros(4), np.zeros(4), SIGMA_N)
+    settings = replace(SETTINGS, robot=RobotSettings(antenna=(*antenna, 0.0)))
+    kept = Buffer(make_host_params(settings, make_params(settings)))
     for k, pose in enumerate(poses):
         c, s = np.cos(pose[2]), np.sin(pose[2])
         place = pose[:2] + np.array([c * antenna[0] - s * antenna[1], s * antenna[0] + c * antenna[1]])

@@ -12,7 +12,7 @@ from hypothesis import given, strategies as st
 from uwbslam_jax import settings
 from uwbslam_jax.errors import ConfigError
 from uwbslam_jax.files import settings_file
-from uwbslam_jax.settings import Settings
+from uwbslam_jax.settings import MapSettings, Settings
 
 positive = st.floats(1e-6, 1e6)
 finite = st.floats(-1e6, 1e6)
@@ -61,7 +61,7 @@ def test_the_design_example_loads(tmp_path: Path) -> None:
     assert settings.uwb.sigma_n == 1.0
     assert type(settings.uwb.sigma_n) is float
     assert settings.uwb.height == {"1": 1.94}
-    assert settings.map == settings.MapSettings()
+    assert settings.map == MapSettings()
 
 
 @pytest.mark.parametrize(

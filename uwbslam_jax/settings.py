@@ -1,17 +1,22 @@
 """Settings a user writes (TOML or flags) and the two things they become: static Config and tunable Params.
 
 Settings are plain host data, one dataclass a TOML section. Config is hashable and fixes sizes and switches, so
-it may be a static argument of a jitted function. Params are the differentiable leaves.
+it may be a static argument of a jitted function. Params are the differentiable leaves; HostParams is the host's copy.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
+
+from uwbslam_jax.measurements import Ranges
+
+Metres = TypeVar("Metres", float, np.ndarray)
+Slot = int | np.ndarray
 
 
 class Params(NamedTuple):
@@ -75,6 +80,40 @@ class Config:
     scan_matching: bool
     correction: bool
     lidar_only: bool
+
+
+@dataclass(frozen=True)
+class HostParams:
+    """What the host takes a range for, in float64: the model of `estimator.ranging` the other way round.
+
+    Attributes:
+      antenna, bias, bias_scale, height, lidar: see Params.
+      sigma_n, nlos_gap_db: see UwbSettings.
+    """
+
+    antenna: Float[np.ndarray, "2"]
+    bias: Float[np.ndarray, "K"]
+    bias_scale: float
+    height: Float[np.ndarray, "K"]
+    lidar: Float[np.ndarray, "3"]
+    sigma_n: float
+    nlos_gap_db: float
+
+    def slant(self, measured: Metres, i: Slot, j: Slot) -> Metres:
+        """Distance of two antennas in space [m] for a range measured between slots, or for several."""
+        return (measured - self.bias[i] - self.bias[j]) / (1.0 + self.bias_scale)
+
+    def rise(self, i: Slot, j: Slot) -> float | np.ndarray:
+        """How much higher the antenna of a slot stands than that of another [m]."""
+        return self.height[i] - self.height[j]
+
+    def flat(self, measured: Metres, i: Slot, j: Slot) -> float | np.ndarray:
+        """Distance in the plane [m]; at least 0.1, however short the range is."""
+        return np.sqrt(np.maximum(self.slant(measured, i, j) ** 2 - self.rise(i, j) ** 2, 0.01))
+
+    def usable(self, ranges: Ranges) -> Bool[np.ndarray, "M"]:
+        """Which ranges of a frame are measured, and not NLOS by their powers; see `ranging.line_of_sight`."""
+        return np.asarray(ranges.valid) & ~(np.asarray(ranges.power_gap) > self.nlos_gap_db)
 
 
 @dataclass(frozen=True)
@@ -221,11 +260,14 @@ def make_config(settings: Settings) -> Config:
     )
 
 
-def make_params(settings: Settings, slots: dict[int, int] | None = None) -> Params:
+def make_params(
+    settings: Settings, slots: dict[int, int] | None = None, found_bias: dict[int, float] | None = None
+) -> Params:
     """The tunable part of the settings.
 
     Args:
       slots: node id -> slot, for the biases and heights that are given by id; ids without a slot are left out.
+      found_bias: slot -> range bias beyond the configured one [m].
     """
     f, odom = settings.filter, settings.odom
     k = 1 + settings.uwb.max_beacons
@@ -235,6 +277,8 @@ def make_params(settings: Settings, slots: dict[int, int] | None = None) -> Para
         bias[slot] = settings.uwb.bias.get(str(node), 0.0)
         if slot > 0:
             height[slot] = settings.uwb.height.get(str(node), settings.robot.antenna[2])
+    for slot, found in (found_bias or {}).items():
+        bias[slot] += found
     of_filter = ("gamma", "sigma_w", "sigma_w_paper", "sigma_w_yaw", "sigma_w_beacon", "sigma_w_carried")
     leaves: dict[str, Any] = {name: getattr(f, name) for name in of_filter}
     leaves |= {name: getattr(f, name) for name in ("sigma_l", "independent_beams", "sigma_map", "sigma_map_yaw")}
@@ -242,3 +286,10 @@ def make_params(settings: Settings, slots: dict[int, int] | None = None) -> Para
     leaves |= {"sigma_n": settings.uwb.sigma_n, "antenna": settings.robot.antenna[:2], "lidar": settings.robot.lidar}
     leaves |= {"bias": bias, "bias_scale": settings.uwb.bias_scale, "height": height}
     return Params(**{name: jnp.asarray(value, jnp.float32) for name, value in leaves.items()})
+
+
+def make_host_params(settings: Settings, params: Params) -> HostParams:
+    """What the host needs of the settings and of the parameters made from them."""
+    leaves = {name: np.asarray(getattr(params, name), float) for name in ("antenna", "bias", "height", "lidar")}
+    uwb = settings.uwb
+    return HostParams(**leaves, bias_scale=float(params.bias_scale), sigma_n=uwb.sigma_n, nlos_gap_db=uwb.nlos_gap_db)

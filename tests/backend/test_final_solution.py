@@ -7,11 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 import small_room as room
-from test_session import BEACONS, SETTINGS, Drive, assert_same_bits, pose_at
+from room_drive import BEACONS, SETTINGS, Drive, assert_same_bits, pose_at
 
 from uwbslam_jax.backend.final_solution import Question, _track
 from uwbslam_jax.backend.graph import KEYFRAME, Graph
-from uwbslam_jax.backend.range_means import RangeMeans
 from uwbslam_jax.backend.revision import Reviser
 from uwbslam_jax.evaluation import rigid_fit
 from uwbslam_jax.numerics.se2_host import wrapped
@@ -150,7 +149,7 @@ def test_between_keyframes_a_direction_that_is_not_seen_is_even(finished) -> Non
         for k in frames[1:]:
             history.sight.values[k] = np.inf
             history.map_poses.values[k] += np.array([0.5, -0.5, 0.0])
-        track = _track(run.graph, history, poses)
+        track = _track(run.graph, poses, *history.passage())
         for k in frames[1:]:
             begin, end = run.graph.keyframes["stamp"][key : key + 2]
             share = (history.stamps[k] - begin) / (end - begin)
@@ -164,10 +163,10 @@ def test_between_keyframes_a_direction_that_is_not_seen_is_even(finished) -> Non
 @pytest.mark.parametrize(("keyframes", "looks"), [(24, 5), (2500, 30)])
 def test_a_revision_may_take_the_longer_the_longer_the_run_is(finished, keyframes: int, looks: int) -> None:
     """The host waits for one that is due: with a fixed delay a long run would stand still for it."""
-    graph = Graph(RangeMeans(0.1))
+    graph = Graph()
     graph.keyframes.extend(np.zeros(keyframes, KEYFRAME))
     run, reviser = finished[0], Reviser()
-    question = Question(graph, np.zeros((keyframes, 3)), {}, run.params, ((1, 0), (2, 0)), False)
+    question = Question(graph, np.zeros((keyframes, 3)), {}, run.host, ((1, 0), (2, 0)), False)
     reviser.begin(run.config, run.params, question, 0.05, 0.0)
     for _ in range(looks - 1):
         assert reviser.look(lambda solution: True) is None

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from uwbslam_jax.backend.graph import Graph
-from uwbslam_jax.backend.range_means import RangeMeans
 from uwbslam_jax.measurements import NAN, Scan
 
 SECOND = 1_000_000_000
@@ -23,7 +22,7 @@ def extend(graph: Graph, *, sees: bool = True, broken: bool = False, x: float | 
 
 def chain(count: int, tied: int) -> Graph:
     """Keyframes in a row, of which the first ones are each laid over the one before."""
-    graph = Graph(RangeMeans(0.1))
+    graph = Graph()
     for _ in range(count):
         extend(graph)
     for k in range(1, tied):
@@ -62,7 +61,7 @@ def test_no_scan_is_laid_over_one_from_before_the_robot_was_carried():
 
 
 def test_scans_are_bounded_by_the_ground_and_the_newest_are_kept():
-    graph, counts = Graph(RangeMeans(0.1)), []
+    graph, counts = Graph(), []
     graph._anchors = [2]
     for k in range(800):  # to and fro over 6 m, twenty times
         extend(graph, x=0.3 * min(k % 40, 40 - k % 40))
@@ -78,7 +77,7 @@ def test_scans_are_bounded_by_the_ground_and_the_newest_are_kept():
 
 
 def test_a_robot_that_rests_under_an_anchor_keeps_its_newest_scans():
-    graph = Graph(RangeMeans(0.1))
+    graph = Graph()
     graph._anchors = list(range(20))
     for _ in range(60):
         extend(graph, x=0.0)

@@ -32,8 +32,10 @@ def relative(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def laid(old: Snapshot, new: Snapshot, guess: np.ndarray) -> Registration:
-    stacked = jax.tree.map(lambda leaf: np.asarray(leaf)[None], view(PARAMS, old))
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[0], register(stacked, view(PARAMS, new), np.float32(guess[None])))
+    stacked = jax.tree.map(lambda leaf: np.asarray(leaf)[None], view(PARAMS.lidar, old))
+    return jax.tree.map(
+        lambda leaf: np.asarray(leaf)[0], register(stacked, view(PARAMS.lidar, new), np.float32(guess[None]))
+    )
 
 
 @pytest.mark.parametrize("off", [(0.0, 0.0, 0.0), (0.25, -0.2, 0.08), (-0.3, 0.1, -0.08)])

@@ -2,75 +2,13 @@
 
 from __future__ import annotations
 
-from collections import deque
-
 import numpy as np
+from loop_graph import BEACONS, host, loop, make, solved, turned
 
 from uwbslam_jax.backend import smoothing
 from uwbslam_jax.backend.graph import Graph
-from uwbslam_jax.backend.range_means import RangeMeans
 from uwbslam_jax.numerics import sparse_least_squares
 from uwbslam_jax.numerics.se2_host import between
-
-BEACONS = {1: np.array([-3.0, 5.0]), 2: np.array([9.0, 6.0]), 3: np.array([8.0, -4.0]), 4: np.array([-2.0, -3.0])}
-SIGMA_N = 0.1
-ANTENNA = np.array([0.1, -0.05])
-K = 5
-
-
-def loop(count: int = 80) -> np.ndarray:
-    """Twice around an ellipse among the beacons."""
-    a = np.linspace(0.0, 4 * np.pi, count)
-    x, y = 3 + 5 * np.cos(a), 1 + 3.5 * np.sin(a)
-    return np.column_stack([x, y, np.unwrap(np.arctan2(3.5 * np.cos(a), -5 * np.sin(a)))])
-
-
-def turned(theta: float, v: np.ndarray) -> np.ndarray:
-    c, s = np.cos(theta), np.sin(theta)
-    return np.array([c * v[0] - s * v[1], s * v[0] + c * v[1]])
-
-
-def make(truth: np.ndarray, seed: int = 0, bias=None, sight: np.ndarray | None = None) -> Graph:
-    """A graph of a track: edges to the keyframe before, and to the one a round before, ranges to every beacon.
-
-    bias: by slot [m]; sight: (3, 3) information of every edge.
-    """
-    rng = np.random.default_rng(seed)
-    bias = bias or dict.fromkeys(range(K), 0.0)
-    information = np.diag([0.005**-2, 0.005**-2, 0.001**-2]) if sight is None else sight
-    drift = np.cumsum(rng.normal(0, [0.01, 0.01, 0.002], truth.shape), axis=0)
-    graph = Graph(RangeMeans(SIGMA_N))
-    for k, pose in enumerate(truth + drift):
-        graph.keyframes.append((k * 400_000_000, k, pose, information, np.zeros(2), 0.0, np.full(3, np.nan), False))
-        graph.scans.append(None)
-    spread = np.linalg.pinv(information)
-    for new in range(1, len(truth)):
-        for old in {new - 1, max(new - len(truth) // 2, 0)} - {new}:
-            z = between(truth[old], truth[new]) + rng.multivariate_normal(np.zeros(3), spread)
-            graph.edges.append((old, new, z, information))
-    for at in range(len(truth) - 1):
-        for slot, spot in BEACONS.items():
-            for share in (0.25, 0.75):
-                pose = (1 - share) * truth[at] + share * truth[at + 1]
-                antenna = pose[:2] + turned(pose[2], ANTENNA)
-                ends = [turned(-p[2], antenna - p[:2]) for p in truth[[at, at + 1]]]
-                d = np.linalg.norm(antenna - spot) + bias[0] + bias[slot] + rng.normal(0, 0.05)
-                graph.ranges.means.append((at, slot, 0, share, *ends, d, 0.05, False))
-    for i in BEACONS:
-        for j in BEACONS:
-            if i < j:
-                d = np.linalg.norm(BEACONS[i] - BEACONS[j]) + bias[i] + bias[j]
-                graph.ranges.pairs[(i, 0), (j, 0)] = deque(d + rng.normal(0, SIGMA_N, 200))
-    return graph
-
-
-def solved(graph: Graph, **changes) -> smoothing.Solution:
-    rng = np.random.default_rng(99)
-    places = {(slot, 0): spot + rng.normal(0, 0.2, 2) for slot, spot in BEACONS.items()}
-    arguments = {"height": np.zeros(K), "bias": np.zeros(K), "bias_scale": 0.0} | changes
-    found = smoothing.solve(graph, graph.poses(), places, **arguments)
-    assert found is not None
-    return found
 
 
 def apart(found: smoothing.Solution, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -169,10 +107,9 @@ def test_where_scans_are_blind_ranges_and_an_even_drive_tell_the_way() -> None:
 def test_too_little_gives_nothing() -> None:
     graph = make(loop(60))
     places = {(slot, 0): spot for slot, spot in BEACONS.items()}
-    empty = Graph(RangeMeans(SIGMA_N))
-    zeros = np.zeros(K)
-    assert smoothing.solve(empty, empty.poses(), places, zeros, zeros, 0.0) is None
-    assert smoothing.solve(graph, graph.poses(), {}, zeros, zeros, 0.0) is None
+    empty = Graph()
+    assert smoothing.solve(empty, empty.poses(), places, host()) is None
+    assert smoothing.solve(graph, graph.poses(), {}, host()) is None
 
 
 def test_derivatives_agree_with_differences() -> None:
@@ -180,9 +117,8 @@ def test_derivatives_agree_with_differences() -> None:
     graph = make(truth, sight=np.diag([0.2**-2, 0.02**-2, 0.004**-2]))
     graph.keyframes["informed"][:] = 0.0  # blind: the even drive counts
     places = {(slot, 0): spot for slot, spot in BEACONS.items()}
-    problem = smoothing.Problem.build(
-        graph, graph.poses(), places, np.array([0.0, 1.0, 0.5, 0.0, 2.0]), np.zeros(K), 0.02
-    )
+    ranging = host(height=np.array([0.0, 1.0, 0.5, 0.0, 2.0]), bias_scale=0.02)
+    problem = smoothing.Problem.build(graph, graph.poses(), places, ranging)
     rng = np.random.default_rng(3)
     x = problem.start(graph.poses() + rng.normal(0, 0.05, truth.shape), places)
     x[-5:] += rng.normal(0, 0.05, 5)
@@ -222,7 +158,7 @@ def test_normal_equations_are_those_of_the_rows(monkeypatch) -> None:
     truth = loop(40)
     graph = make(truth)
     places = {(slot, 0): spot for slot, spot in BEACONS.items()}
-    problem = smoothing.Problem.build(graph, graph.poses(), places, np.zeros(K), np.zeros(K), 0.0)
+    problem = smoothing.Problem.build(graph, graph.poses(), places, host())
     x = problem.start(graph.poses() + np.random.default_rng(5).normal(0, 0.05, truth.shape), places)
     fill = problem._rows(x[:3] + 1e-5, 0.3, (30.0, 2.0))
     J, r = stacked(fill, x)
@@ -242,7 +178,7 @@ def test_unknowns_are_eliminated_in_an_order_that_keeps_the_factor_sparse() -> N
     truth = np.tile(loop(40), (5, 1))
     graph = make(truth)
     places = {(slot, 0): spot for slot, spot in BEACONS.items()}
-    problem = smoothing.Problem.build(graph, graph.poses(), places, np.zeros(K), np.zeros(K), 0.0)
+    problem = smoothing.Problem.build(graph, graph.poses(), places, host())
     assert sorted(problem.rank) == list(range(problem.size))
 
     def entries(rank: np.ndarray) -> tuple[int, int]:

@@ -10,12 +10,13 @@ import pytest
 import small_room as room
 
 from uwbslam_jax.beacons.keeper import BeaconKeeper
-from uwbslam_jax.estimator import init, state_vector
+from uwbslam_jax.estimator import HostView, init, state_vector
 from uwbslam_jax.estimator.state import Estimate, State
+from uwbslam_jax.mapping import Tiles
 from uwbslam_jax.measurements import Frame, StampedFrame
 from uwbslam_jax.result import EventKind
 from uwbslam_jax.session.frame_assembler import pad_scan
-from uwbslam_jax.settings import Params, Settings, UwbSettings, make_config, make_params
+from uwbslam_jax.settings import Params, Settings, UwbSettings, make_config, make_host_params, make_params
 
 SETTINGS = Settings(uwb=UwbSettings(max_beacons=3, sigma_n=0.1))
 CONFIG = make_config(SETTINGS)
@@ -55,7 +56,7 @@ class World:
         params: Params | None = None,
         seed: int = 0,
     ):
-        self.keeper, self.state = BeaconKeeper(SETTINGS), state
+        self.keeper, self.state = BeaconKeeper(), state
         self.walk = np.zeros((4, 2))
         self._pairs = pairs
         self.params = make_params(SETTINGS) if params is None else params
@@ -112,8 +113,12 @@ class World:
         return StampedFrame(round(self.time * SECOND), frame), Estimate._make({**empty, **known}.values())
 
     def _look(self, pending) -> None:
-        self.state, events = self.keeper.look(self.state, self.params, pending)
-        self.events += events
+        host = make_host_params(SETTINGS, self.params)
+        slots = {node: node for node in range(CONFIG.nodes)}
+        view = HostView(CONFIG, self.params, host, self.state, Tiles(0.05), slots, pending, np.zeros((0, 3)), {}, {})
+        changes = self.keeper.look(view)
+        self.state = self.state if changes.state is None else changes.state
+        self.events += changes.events
 
     def position(self, slot: int) -> np.ndarray:
         return np.asarray(state_vector.unpack(self.state.belief.mean).positions[slot], float)

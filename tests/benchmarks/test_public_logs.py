@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_without_lidar import SCALE, driven
+from wheel_drive import SCALE, driven
 
 from benchmarks.accuracy import batch_solution
 from benchmarks.accuracy.public_logs import DRIVEN, P2P_BAR_M, p2p

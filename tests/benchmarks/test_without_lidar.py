@@ -9,15 +9,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from wheel_drive import BEACONS, SCALE, START, driven
 
 from uwbslam_jax.__main__ import main
-from uwbslam_jax.api import run_messages
+from uwbslam_jax.api import run
 from uwbslam_jax.files.mcap_log import LogWriter
 from uwbslam_jax.files.run_folder import read_run
-from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, TruthMessage
+from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage
 from uwbslam_jax.settings import MapSettings, RobotSettings, Settings, UwbSettings
 
-START = 1_700_000_000_000_000_000
 SMALL = Settings(map=MapSettings(size_m=12.8))
 """There is nothing to draw, and a small window compiles and runs faster."""
 NODES = {4: (0.0, 0.0), 9: (6.0, 0.5), 15: (1.0, 5.0), 22: (7.0, 5.5), 31: (3.5, 2.0), 57: (8.8, 2.4)}
@@ -72,8 +72,8 @@ class TestAtRest:
 
     def test_an_unknown_common_offset_is_found_when_asked(self) -> None:
         settings = replace(SMALL, uwb=UwbSettings(fit_offset=True))
-        result, truth = run_messages(at_rest(), settings, online=True)
-        assert truth is None
+        result = run(at_rest(), settings, online=True)
+        assert result.truth is None
         assert result.summary["relative"]["offset_m"] == pytest.approx(2 * DELAY, abs=0.15)
         assert rms_after_fit({b.id: b.position for b in result.beacons}, NODES) < 0.12
 
@@ -81,40 +81,12 @@ class TestAtRest:
         robot = RobotSettings(id=31, antenna=(0.2, -0.1, 0.0))
         messages = [m for m in at_rest() if isinstance(m, RangeMessage)]
         messages = [replace(m, range=m.range - 2 * DELAY) for m in messages]
-        result, _ = run_messages(messages, replace(SMALL, robot=robot), online=True)
+        result = run(messages, replace(SMALL, robot=robot), online=True)
         beacons = {b.id: b.position for b in result.beacons}
         assert sorted(beacons) == sorted(set(NODES) - {31})
         for node, position in beacons.items():
             away = np.linalg.norm(position - np.array(robot.antenna[:2]))
             assert away == pytest.approx(np.hypot(*np.subtract(NODES[node], NODES[31])), abs=0.15)
-
-
-BEACONS = {3: (-4.0, 9.0), 5: (16.0, 11.0), 8: (14.0, -6.0), 13: (-5.0, -4.0)}
-SCALE = 0.07
-
-
-def driven(seconds: float = 60.0, scale: float = SCALE) -> list[Message]:
-    """Figures of eight among four beacons at 1 m/s: wheels that drift, one range at a time that is long by a share of
-    the distance."""
-    rng = np.random.default_rng(5)
-    t = np.arange(0.0, seconds, 0.1)
-    phase = 2 * np.pi * t / 30.0
-    true = np.stack([5.0 + 6.0 * np.sin(phase), 2.0 + 3.0 * np.sin(2 * phase)], axis=-1)
-    course = np.unwrap(np.arctan2(*np.gradient(true, axis=0).T[::-1]))
-    length = np.hypot(*np.diff(true, axis=0).T) * 1.01 * (1 + 0.02 * rng.normal(size=len(t) - 1))
-    yaw = np.concatenate([[0.0], np.cumsum(np.diff(course) + 0.002 * rng.normal(size=len(t) - 1))])
-    middle = (yaw[1:] + yaw[:-1]) / 2
-    steps = length[:, None] * np.stack([np.cos(middle), np.sin(middle)], axis=-1)
-    wheels = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
-    messages: list[Message] = [TruthMessage(START, node, x, y) for node, (x, y) in BEACONS.items()]
-    for k, second in enumerate(t):
-        stamp = START + round(second * 1e9)
-        messages.append(TruthMessage(stamp, None, *true[k].tolist(), float(course[k])))
-        messages.append(OdometryMessage(stamp, *wheels[k].tolist(), float(yaw[k])))
-        node = list(BEACONS)[k % len(BEACONS)]
-        distance = np.hypot(*(true[k] - BEACONS[node])) * (1 + scale) + 0.1 * rng.normal()
-        messages.append(RangeMessage(stamp, 0, node, float(distance)))
-    return messages
 
 
 class TestWheelsAndRanges:
@@ -143,7 +115,7 @@ class TestWheelsAndRanges:
         configured = replace(SMALL, uwb=UwbSettings(bias_scale=SCALE))
         beacons = []
         for settings in (SMALL, configured):
-            result, _ = run_messages(driven(), settings, online=True)
+            result = run(driven(), settings, online=True)
             beacons.append({b.id: b.position for b in result.beacons})
         plain, mended = (np.linalg.norm(found[5] - found[13]) for found in beacons)
         true = np.hypot(*np.subtract(BEACONS[5], BEACONS[13]))
@@ -152,8 +124,8 @@ class TestWheelsAndRanges:
 
     def test_wheels_alone_are_dead_reckoning(self) -> None:
         wheels = [m for m in driven(10.0) if isinstance(m, OdometryMessage)]
-        result, truth = run_messages(wheels, SMALL, online=True)
-        assert truth is None
+        result = run(wheels, SMALL, online=True)
+        assert result.truth is None
         assert len(result.stamps) == 100
         assert not result.beacons
         travelled = np.linalg.norm(result.poses[-1, :2] - result.poses[0, :2])

@@ -14,14 +14,12 @@ import numpy as np
 import pytest
 
 from uwbslam_jax.__main__ import COMMANDS, main
-from uwbslam_jax.api import run_log
+from uwbslam_jax.api import Result, run
 from uwbslam_jax.cli import commands
-from uwbslam_jax.evaluation import Truth
 from uwbslam_jax.files import settings_file
 from uwbslam_jax.files.mcap_log import LogReader, LogWriter
 from uwbslam_jax.files.run_folder import read_run
 from uwbslam_jax.measurements import Message, RangeMessage, ScanMessage, TruthMessage
-from uwbslam_jax.result import Result
 from uwbslam_jax.session.result_builder import Facts, to_result
 from uwbslam_jax.session.runner import fit_beams
 from uwbslam_jax.session.session import CONTROL_EVERY, Session
@@ -32,8 +30,6 @@ BEAMS = 181
 FRAMES = 135  # decided after 8 s; not a whole number of groups
 SMALL = replace(Settings(), map=replace(Settings().map, size_m=25.6))
 FILES = {"trajectory.tum", "beacons.csv", "map.pgm", "map.yaml", "result.mcap", "summary.json", "report.html"}
-
-Run = tuple[Result, Truth | None]
 
 
 def write(path: Path, messages: Sequence[Message]) -> Path:
@@ -56,8 +52,8 @@ def log(tmp_path_factory: pytest.TempPathFactory, messages: list[Message]) -> Pa
 
 
 @pytest.fixture(scope="session")
-def batch(log: Path) -> Run:
-    return run_log(log, SMALL)
+def batch(log: Path) -> Result:
+    return run(log, SMALL)
 
 
 @pytest.fixture(scope="session")
@@ -142,8 +138,8 @@ class TestRun:
         assert figures["beacons, mean"] == f"{summary['beacon_mean_m']:.3f} m"
         assert figures["heading, median"] == f"{summary['heading_deg_median']:.2f} deg"
 
-    def test_online_and_batch_give_the_same_bits(self, log: Path, batch: Run) -> None:
-        online, (grouped, _) = run_log(log, SMALL, online=True)[0], batch
+    def test_online_and_batch_give_the_same_bits(self, log: Path, batch: Result) -> None:
+        online, grouped = run(log, SMALL, online=True), batch
         assert FRAMES % CONTROL_EVERY, "the last frames are no whole group: both ways of stepping take part"
         assert grouped.summary["decided_at"] is not None
         for name in ("stamps", "poses", "online_covs", "range_residuals", "scan_points"):
@@ -154,8 +150,8 @@ class TestRun:
         ]
         assert online.events == grouped.events
 
-    def test_a_result_speaks_of_ids_and_seconds(self, batch: Run, messages: list[Message]) -> None:
-        result, truth = batch
+    def test_a_result_speaks_of_ids_and_seconds(self, batch: Result, messages: list[Message]) -> None:
+        result, truth = batch, batch.truth
         ids = {3, 5, 7, 9, 12}
         assert truth is not None
         assert set(truth.beacons) == ids
@@ -166,8 +162,8 @@ class TestRun:
         assert result.stamps.tolist() == stamps
         assert all(len(series) == FRAMES for series in result.diagnostics.values())
 
-    def test_the_last_scan_lies_on_the_walls(self, batch: Run) -> None:
-        result, _ = batch
+    def test_the_last_scan_lies_on_the_walls(self, batch: Result) -> None:
+        result = batch
         cells = np.floor((result.scan_points - result.map.origin) / result.map.resolution).astype(int)
         size = np.array(result.map.log_odds.shape)[::-1]
         cells = cells[((cells > 0) & (cells < size - 1)).all(axis=1)]  # the small window does not hold every wall
@@ -175,11 +171,11 @@ class TestRun:
         around = [result.map.log_odds[cells[:, 1] + dy, cells[:, 0] + dx] for dx in (-1, 0, 1) for dy in (-1, 0, 1)]
         assert np.mean(np.max(around, axis=0) > 0) > 0.9
 
-    def test_the_estimator_never_sees_the_truth(self, tmp_path: Path, batch: Run, messages: list[Message]) -> None:
+    def test_the_estimator_never_sees_the_truth(self, tmp_path: Path, batch: Result, messages: list[Message]) -> None:
         blind = write(tmp_path / "blind.mcap", [m for m in messages if not isinstance(m, TruthMessage)])
-        result, truth = run_log(blind, SMALL)
-        assert truth is None
-        assert np.array_equal(result.poses, batch[0].poses)
+        result = run(blind, SMALL)
+        assert result.truth is None
+        assert np.array_equal(result.poses, batch.poses)
 
     def test_a_cut_recording_is_used_up_to_there(
         self, tmp_path: Path, log: Path, capsys: pytest.CaptureFixture[str]

@@ -778,8 +778,3 @@ def test_intel(shared_data: Path) -> None:
     assert all(0 <= m.source <= 6 and m.range < 60 for m in first if isinstance(m, RangeMessage))
     assert reader.dropped.total() == 0
     assert reader.topics == {"/scan": "scan", "/uwb/ranges": "uwb", "/odom": "odom"}
-
-
-def test_the_module_names_its_error() -> None:
-    pass
-    assert issubclass(LogError, ValueError)

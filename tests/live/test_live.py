@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from browser import CHROMIUM, DRIVER, MISSING, Browser
+from made_result import make_result
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
-from test_report import make_result
 
 from uwbslam_jax.__main__ import main
 from uwbslam_jax.files.mcap_log import LogReader

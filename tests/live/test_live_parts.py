@@ -138,11 +138,11 @@ import sys, time
 from pathlib import Path
 import numpy as np
 from uwbslam_drivers.clock import host_time
-from uwbslam_jax.config import Settings
-from uwbslam_jax.frames import FrameAssembler
-from uwbslam_jax.inbox import Inbox
+from uwbslam_jax.settings import Settings
+from uwbslam_jax.session import FrameAssembler
+from uwbslam_jax.live.message_queue import Inbox
 from uwbslam_jax.measurements import RangeMessage, ScanMessage
-from uwbslam_jax.recorder import LogRecorder
+from uwbslam_jax.live.recorder import LogRecorder
 
 recorder = LogRecorder(Path(sys.argv[1]), Settings())
 inbox = Inbox(recorder.record)

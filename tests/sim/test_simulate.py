@@ -18,16 +18,16 @@ from uwbslam_jax.sim import (
     START_NS,
     Scenario,
     beacon_positions,
+    make_scenario,
     rays,
     scan_ranges,
-    scenario,
     settings_overrides,
     simulate,
     worlds,
 )
 from uwbslam_jax.sim.paths import Along, Carried, Path, Rest, Track, Turn
 
-ready = cache(scenario)
+ready = cache(make_scenario)
 WITHOUT_SCANS = 1e-3
 """A scan rate [Hz] at which tests of the ranges do not wait for ray casting."""
 
@@ -86,7 +86,7 @@ def test_cast_equals_a_slow_one(spread: float) -> None:
 
 
 def test_scan_noise_has_its_sigma() -> None:
-    made = scenario("hall", 2, duration_s=3.0)
+    made = make_scenario("hall", 2, duration_s=3.0)
     scans = [m for m in simulate(made) if isinstance(m, ScanMessage)]
     assert len(scans) == 30
     error = np.concatenate([m.ranges - scan_ranges(made, float(seconds([m.stamp])[0])) for m in scans])
@@ -120,7 +120,7 @@ def test_lidar_is_mounted_where_it_says() -> None:
 
 
 def test_reach_and_blinding_leave_no_return() -> None:
-    made = scenario("corridor", 1, duration_s=1.0)
+    made = make_scenario("corridor", 1, duration_s=1.0)
     made = replace(made, lidar=replace(made.lidar, blind=((0.5, 0.8),)))
     scans = [m for m in simulate(made) if isinstance(m, ScanMessage)]
     assert all(np.all((m.ranges <= 6.0) | np.isinf(m.ranges)) for m in scans)
@@ -128,7 +128,7 @@ def test_reach_and_blinding_leave_no_return() -> None:
 
 
 def test_beams_are_lost_more_often_where_a_wall_is_seen_flat() -> None:
-    made = scenario("corridor", 3, duration_s=6.0)
+    made = make_scenario("corridor", 3, duration_s=6.0)
     made = replace(made, lidar=replace(made.lidar, reach=np.inf, dropout=0.02, grazing=0.2))
     lost, flat = [], []
     for m in simulate(made):
@@ -147,7 +147,7 @@ def test_beams_are_lost_more_often_where_a_wall_is_seen_flat() -> None:
 
 
 def test_devices_count_in_steps_and_start_late_by_their_jitter() -> None:
-    made = scenario("hall", 3, duration_s=3.0)
+    made = make_scenario("hall", 3, duration_s=3.0)
     stamps, readings = [], []
     for m in simulate(made):
         if isinstance(m, ScanMessage):
@@ -162,7 +162,7 @@ def test_devices_count_in_steps_and_start_late_by_their_jitter() -> None:
 
 
 def test_exchanges_fail_now_and_then() -> None:
-    made = scenario("hall", 1, duration_s=30.0)
+    made = make_scenario("hall", 1, duration_s=30.0)
     whole = ranges_of(replace(made, uwb=replace(made.uwb, loss=0.0)))
     kept = len(ranges_of(made)) / len(whole)
     assert abs(kept - 0.98) < 4 * np.sqrt(0.98 * 0.02 / len(whole))
@@ -172,7 +172,7 @@ def test_exchanges_fail_now_and_then() -> None:
 
 
 def test_ranges_scatter_about_the_distance_between_antennas() -> None:
-    made = scenario("lever_arms", 4, duration_s=30.0)
+    made = make_scenario("lever_arms", 4, duration_s=30.0)
     messages = ranges_of(replace(made, uwb=replace(made.uwb, loss=0.0)))
     assert len(messages) == 15 * 299
     error = np.array([m.range for m in messages]) - true_distances(made, messages)
@@ -183,14 +183,14 @@ def test_ranges_scatter_about_the_distance_between_antennas() -> None:
 
 
 def test_pairs_of_a_round_are_3_ms_apart() -> None:
-    made = scenario("hall", 1, duration_s=2.0)
+    made = make_scenario("hall", 1, duration_s=2.0)
     stamps = [m.stamp for m in ranges_of(replace(made, uwb=replace(made.uwb, jitter=0.0, loss=0.0)))]
     assert set(np.diff(stamps[:15])) == {3_000_000}
     assert stamps[15] - stamps[0] == 100_000_000
 
 
 def test_walls_lengthen_only_what_they_block() -> None:
-    blocked_made = scenario("nlos", 5, duration_s=40.0)
+    blocked_made = make_scenario("nlos", 5, duration_s=40.0)
     # unrounded, so that the least excess shows
     blocked_made = replace(blocked_made, uwb=replace(blocked_made.uwb, quantum=0.0, nlos_detectable=0.95))
     clear_made = replace(blocked_made, uwb=replace(blocked_made.uwb, nlos=False))
@@ -212,7 +212,7 @@ def test_walls_lengthen_only_what_they_block() -> None:
 
 
 def test_a_knob_leaves_the_other_numbers_alone() -> None:
-    made = scenario("hall", 6, duration_s=3.0)
+    made = make_scenario("hall", 6, duration_s=3.0)
 
     def by_exchange(**knobs: object) -> dict[tuple[int, int, int], tuple[float, float]]:
         messages = ranges_of(replace(made, uwb=replace(made.uwb, **knobs)))
@@ -243,12 +243,12 @@ def test_early_locks_hit_one_beacon_in_its_stretches(seed: int) -> None:
 
 
 def test_special_radios() -> None:
-    assert all(np.isnan(m.receive_power) for m in ranges_of(scenario("nlos_silent", 1, 2.0)))
-    assert all(m.source == 0 for m in ranges_of(scenario("robot_only", 1, 2.0)))
-    t = seconds([m.stamp for m in ranges_of(replace(scenario("uwb_silent", 1), duration=92.0))])
+    assert all(np.isnan(m.receive_power) for m in ranges_of(make_scenario("nlos_silent", 1, 2.0)))
+    assert all(m.source == 0 for m in ranges_of(make_scenario("robot_only", 1, 2.0)))
+    t = seconds([m.stamp for m in ranges_of(replace(make_scenario("uwb_silent", 1), duration=92.0))])
     assert not np.any((t >= 60.0) & (t < 90.0))
     assert t.max() > 91.0
-    biased = scenario("biased", 1, duration_s=30.0)
+    biased = make_scenario("biased", 1, duration_s=30.0)
     assert np.sqrt(np.mean(np.square(list(biased.uwb.bias.values())))) == pytest.approx(0.15)
     messages = ranges_of(biased)
     error = np.array([m.range for m in messages]) - true_distances(biased, messages)
@@ -436,7 +436,7 @@ def test_stamps_rise_on_each_topic(name: str) -> None:
 
 
 def test_a_simulation_repeats_to_the_bit() -> None:
-    first, again, other = (list(simulate(scenario("nlos", seed, duration_s=2.0))) for seed in (1, 1, 2))
+    first, again, other = (list(simulate(make_scenario("nlos", seed, duration_s=2.0))) for seed in (1, 1, 2))
 
     def flat(messages: list) -> list:
         return [(m.stamp, m.ranges.tobytes()) if isinstance(m, ScanMessage) else repr(m) for m in messages]
@@ -446,7 +446,7 @@ def test_a_simulation_repeats_to_the_bit() -> None:
 
 
 def test_truth_follows_the_path() -> None:
-    made = scenario("hall", 3, duration_s=8.0)
+    made = make_scenario("hall", 3, duration_s=8.0)
     truths = [m for m in simulate(replace(made, lidar=replace(made.lidar, beams=3))) if isinstance(m, TruthMessage)]
     robot = [m for m in truths if m.node is None]
     pose = made.path.pose(seconds([m.stamp for m in robot]))
@@ -456,7 +456,7 @@ def test_truth_follows_the_path() -> None:
 
 
 def test_odometry_drifts_by_its_scale() -> None:
-    made = scenario("slow_lidar", 1, duration_s=90.0)
+    made = make_scenario("slow_lidar", 1, duration_s=90.0)
     odometry = [m for m in simulate(made) if isinstance(m, OdometryMessage)]
     xy = np.array([(m.x, m.y) for m in odometry])
     driven = np.hypot(*np.diff(xy, axis=0).T).sum()
@@ -475,4 +475,4 @@ def test_what_a_user_would_configure() -> None:
 
 def test_an_unknown_name_lists_the_known_ones() -> None:
     with pytest.raises(ValueError, match="workshop"):
-        scenario("wrokshop", 0)
+        make_scenario("wrokshop", 0)

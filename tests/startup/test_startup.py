@@ -13,7 +13,7 @@ from start_of_run import BEACONS, IDS, SETTINGS
 from uwbslam_jax.estimator import init, state_vector
 from uwbslam_jax.mapping.tiled_map import Tiles
 from uwbslam_jax.numerics import se2, se2_host
-from uwbslam_jax.settings import make_config, make_params
+from uwbslam_jax.settings import make_config, make_host_params, make_params
 from uwbslam_jax.startup import adopt, decide
 
 TRUTH = np.array(list(BEACONS.values()))
@@ -30,7 +30,7 @@ def test_at_rest_it_waits_for_motion():
 
 
 def test_an_empty_buffer_waits_for_motion():
-    empty = decide.Buffer(np.zeros(2), np.zeros(4), np.zeros(4), 0.1)
+    empty = decide.Buffer(make_host_params(SETTINGS, PARAMS))
     assert decide.solve(empty, IDS).status == "waiting for motion"
 
 
@@ -125,7 +125,7 @@ def test_adopted_state_is_the_start_in_the_published_frame():
     v, before = np.asarray(s.velocities[0]), np.array([0.3, 0.7])
     np.testing.assert_allclose(np.hypot(*v), np.hypot(*before), rtol=1e-6)
     turned = np.asarray(se2.rotation(-s.heading) @ s.velocities[0])
-    np.testing.assert_allclose(turned, decide.rotation(-pose[2]) @ before, atol=1e-5)
+    np.testing.assert_allclose(turned, se2_host.rotation_matrix(-pose[2]) @ before, atol=1e-5)
     assert float(s.yaw_rate) == float(state_vector.unpack(state.belief.mean).yaw_rate)
 
 
@@ -164,7 +164,7 @@ def test_covariance_of_the_velocity_turns_with_the_frame():
     _, _, _, adopted, pose = adopted_case()
     turn = float(state_vector.unpack(adopted.state.belief.mean).heading) - pose[2]
     J = np.eye(3)
-    J[:2, :2] = decide.rotation(turn)
+    J[:2, :2] = se2_host.rotation_matrix(turn)
     P = np.asarray(adopted.state.belief.cov)
     np.testing.assert_allclose(P[np.ix_(MOTION, MOTION)], J @ MOTION_COV @ J.T, atol=1e-6)  # float32
 

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import small_room as room
 from derivatives import assert_reverse, double, value_and_gradient
+from known_room import BEACONS, FLAT, PAIRS, PARAMS, drawn_map, knowing
+from loop_graph import ANTENNA, BEACONS as SPOTS, K, host, loop, make, solved
 from scipy.integrate import quad
-from test_slam import BEACONS, FLAT, PAIRS, PARAMS, knowing, room_map  # noqa: F401
-from test_smoothing import ANTENNA, BEACONS as SPOTS, K, loop, make, solved
 
 from uwbslam_jax.errors import ConfigError
 from uwbslam_jax.estimator import ranging
 from uwbslam_jax.files.settings_file import differences, from_dict
 from uwbslam_jax.numerics.se2_host import between, compose
-from uwbslam_jax.settings import Params, Settings
+from uwbslam_jax.settings import Settings
 from uwbslam_jax.tuning import calibration, fit, parameters, rollout
 from uwbslam_jax.tuning.likelihood import Objective, Score
 
@@ -37,7 +37,8 @@ def drive(count: int):
 
 
 @pytest.mark.usefixtures("x64")
-def test_gradient_through_fifty_steps_agrees_with_central_differences(room_map):  # noqa: F811
+def test_gradient_through_fifty_steps_agrees_with_central_differences():
+    room_map = drawn_map()
     finest = room_map._replace(levels=room_map.levels[:1])
     state, frames, params = double(knowing(finest, velocity=(0.3, 0.1))), double(drive(STEPS)), double(PARAMS)
 
@@ -65,7 +66,8 @@ def room_frames(count: int):
     return jax.tree.map(lambda leaf: jnp.zeros((count, *np.shape(leaf)), np.asarray(leaf).dtype), frame)
 
 
-def test_a_window_that_is_cut_out_sees_the_same_ground(room_map):  # noqa: F811
+def test_a_window_that_is_cut_out_sees_the_same_ground():
+    room_map = drawn_map()
     origin = np.asarray(room_map.origin, float) + np.array([12.8, -6.4])  # cells of 0.1 m: tiles of 6.4 m
     cut = rollout.cropped(room_map, 0.1, origin, 128)
     for old, new, shift in zip(room_map.levels, cut.levels, (64, 32), strict=True):
@@ -211,12 +213,6 @@ def rotated(theta: float, v: np.ndarray) -> np.ndarray:
     return np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]]) @ v
 
 
-def params_of() -> Params:
-    return PARAMS._replace(
-        antenna=jnp.asarray(ANTENNA, jnp.float32), bias=jnp.zeros(K), height=jnp.zeros(K), lidar=jnp.zeros(3)
-    )
-
-
 MOUNTING = np.array([0.2, -0.1, 0.1])
 BIAS = {0: 0.1, 1: -0.15, 2: 0.05, 3: 0.2, 4: -0.1}
 ASKED = [*(f"bias.{slot}" for slot in BIAS), "lidar.x", "lidar.y", "lidar.yaw"]
@@ -227,7 +223,7 @@ def test_mounting_and_biases_are_found_or_told_as_not_observed(wheels):
     # a scan laid at X l has the robot at X l l0^-1, with l0 the origin
     graph = mounted(MOUNTING, BIAS, wheels=wheels)
     solution, slots = solved(graph), {slot: slot for slot in range(K)}
-    found, sigma, told = calibration.solve(graph, params_of(), solution, slots, ASKED, np.zeros(len(ASKED)))
+    found, sigma, told = calibration.solve(graph, host(), solution, slots, ASKED, np.zeros(len(ASKED)))
     assert len(SPOTS) == K - 1
     observed, error = np.array(told) == "", found - np.array([*BIAS.values(), *MOUNTING])
     assert observed[:K].sum() >= 3  # inside a ring of beacons some biases look like beacons farther off

@@ -15,7 +15,7 @@ from uwbslam_jax.backend.range_means import Node
 from uwbslam_jax.backend.smoothing import Solution, solve
 from uwbslam_jax.estimator import frame_motion, published
 from uwbslam_jax.numerics import between, compose, numeric_jacobian, turned, wrapped
-from uwbslam_jax.settings import Params
+from uwbslam_jax.settings import HostParams
 
 
 class Question(NamedTuple):
@@ -24,7 +24,7 @@ class Question(NamedTuple):
     Attributes:
       graph: what was collected. poses: (N, 3) of its keyframes to start from [m, m, rad].
       places: resting place of a beacon -> where it is, about (2,) [m].
-      params: with the heights and biases that the user configured.
+      host: with the heights and biases that the user configured.
       frame_nodes: the resting places that make the published frame: its origin, and +x.
       biased: whether ranges were found to be biased before.
     """
@@ -32,7 +32,7 @@ class Question(NamedTuple):
     graph: Graph
     poses: np.ndarray
     places: dict[Node, np.ndarray]
-    params: Params
+    host: HostParams
     frame_nodes: tuple[Node, Node]
     biased: bool
 
@@ -63,9 +63,8 @@ def look_back(question: Question, stamps: np.ndarray, poses: np.ndarray, sight: 
 
 def framed_solution(question: Question) -> Solution | None:
     """The solution, and its covariance, in the published frame."""
-    graph, poses, places, params, frame_nodes, biased = question
-    height, bias = np.asarray(params.height, float), np.asarray(params.bias, float)
-    solution = solve(graph, poses, places, height, bias, float(params.bias_scale), biased=biased)
+    graph, poses, places, host, frame_nodes, biased = question
+    solution = solve(graph, poses, places, host, biased=biased)
     return None if solution is None else _framed(solution, poses, frame_nodes)
 
 

@@ -19,7 +19,7 @@ from uwbslam_jax.backend.registration import View, register, view
 from uwbslam_jax.estimator import Estimate, map_pose
 from uwbslam_jax.measurements import Scan, Snapshot, StampedFrame
 from uwbslam_jax.numerics import Column, between, turned, wrapped
-from uwbslam_jax.settings import Config, Params
+from uwbslam_jax.settings import HostParams
 
 _MOVED = (0.25, 0.2)
 """A keyframe every so much of way or turn [m, rad]."""
@@ -94,7 +94,7 @@ class Graph:
         the same.
     """
 
-    ranges: RangeMeans
+    ranges: RangeMeans = field(default_factory=RangeMeans)
     keyframes: Column = field(default_factory=lambda: Column(dtype=KEYFRAME))
     edges: Column = field(default_factory=lambda: Column(dtype=EDGE))
     scans: list[Scan | None] = field(default_factory=list)
@@ -178,10 +178,10 @@ class Graph:
         self.keyframes["pose"][:] = poses
         self.keyframes["informed"][:] = R @ self.keyframes["informed"] @ R.T
 
-    def add(self, config: Config, params: Params, number: int, frame: StampedFrame, estimate: Estimate) -> None:
+    def add(self, host: HostParams, number: int, frame: StampedFrame, estimate: Estimate) -> None:
         """Take in one frame. number: in the history."""
         pose = map_pose(estimate)
-        self.ranges.hear(frame, estimate, pose, params, config.nlos_gap_db)
+        self.ranges.hear(frame, estimate, pose, host)
         self._roll(frame)
         informed = np.asarray(estimate.information, float)
         if len(self.keyframes) and not self._far(pose, frame.stamp, informed):
@@ -191,14 +191,14 @@ class Graph:
         else:
             last = self.keyframes[-1]
             stamps = int(last["stamp"]), frame.stamp
-            self.ranges.close(len(self.keyframes) - 1, stamps, (last["pose"], pose))
+            self.ranges.close(len(self.keyframes) - 1, stamps, (last["pose"], pose), host.sigma_n)
         drift = turned(-pose[2], np.asarray(estimate.velocity, float))
         told = pose, informed, drift, estimate.yaw_rate, self._wheels, self._broken
         self.keyframes.append((frame.stamp, number, *told))
         self.scans.append(_packed(frame.frame.scan) if _sees(frame) else None)
         self._wheels, self._broken = np.zeros(3), False
         if self.scans[-1] is not None:
-            self._tie(params)
+            self._tie(host)
         self._thin()
 
     def _far(self, pose: np.ndarray, stamp: int, informed: np.ndarray) -> bool:
@@ -217,7 +217,7 @@ class Graph:
             step = np.asarray(odometry.increment, float)
             self._wheels = np.append(self._wheels[:2] + turned(self._wheels[2], step[:2]), self._wheels[2] + step[2])
 
-    def _tie(self, params: Params) -> None:
+    def _tie(self, host: HostParams) -> None:
         """Edges from the newest keyframe to older ones whose scans it can be laid over."""
         new = len(self.keyframes) - 1
         old = self._candidates(new)
@@ -225,16 +225,16 @@ class Graph:
             return
         padded = (old * _TIES)[:_TIES]  # always as many: nothing is compiled again
         guess = between(self.keyframes["pose"][padded], self.keyframes["pose"][new])
-        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *(self._view(params, k) for k in padded))
-        found = jax.device_get(register(stacked, self._view(params, new), np.float32(guess)))
+        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *(self._view(host, k) for k in padded))
+        found = jax.device_get(register(stacked, self._view(host, new), np.float32(guess)))
         believed = np.all(np.abs(found.pose - guess) < _BELIEVED, axis=1) & (found.share > _SHARE)
         for k in np.flatnonzero(believed[: len(old)]):
             self.edges.append((old[k], new, found.pose[k], found.information[k]))
 
-    def _view(self, params: Params, number: int) -> View:
+    def _view(self, host: HostParams, number: int) -> View:
         """The scan of a keyframe, made ready."""
         made = self._views.pop(number, None)
-        self._views[number] = made or jax.device_get(view(params, self.snapshot(number)))
+        self._views[number] = made or jax.device_get(view(np.float32(host.lidar), self.snapshot(number)))
         if len(self._views) > _VIEWS:
             del self._views[next(iter(self._views))]
         return self._views[number]

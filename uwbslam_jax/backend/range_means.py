@@ -15,7 +15,7 @@ import numpy as np
 from uwbslam_jax.estimator import Estimate
 from uwbslam_jax.measurements import StampedFrame
 from uwbslam_jax.numerics import Column, mean_sigma
-from uwbslam_jax.settings import Params
+from uwbslam_jax.settings import HostParams
 
 _WINDOW = 21
 """So many ranges of a pair tell how much they scatter."""
@@ -63,11 +63,9 @@ class RangeMeans:
     """What was ranged so far.
 
     Attributes:
-      sigma_n: standard deviation of a range [m].
       means: rows of MEAN. pairs: newest ranges between two beacons at rest, by their nodes.
     """
 
-    sigma_n: float
     means: Column = field(default_factory=lambda: Column(dtype=MEAN))
     pairs: dict[tuple[Node, Node], deque[float]] = field(default_factory=dict)
     _places: dict[int, int] = field(default_factory=dict)
@@ -77,7 +75,7 @@ class RangeMeans:
     def copy(self) -> RangeMeans:
         """The means and pairs there are now; what is added later does not change them."""
         pairs = {pair: deque(kept) for pair, kept in self.pairs.items()}
-        return RangeMeans(self.sigma_n, self.means.copy(), pairs)
+        return RangeMeans(self.means.copy(), pairs)
 
     def node(self, slot: int) -> Node:
         """The place where a beacon rests now."""
@@ -93,15 +91,13 @@ class RangeMeans:
         rows, (_, place) = self.means.values, self.node(slot)
         self.means.keep((rows["slot"] != slot) | (rows["place"] != place) | (rows["at"] >= before))
 
-    def hear(
-        self, frame: StampedFrame, estimate: Estimate, pose: np.ndarray, params: Params, nlos_gap_db: float
-    ) -> None:
+    def hear(self, frame: StampedFrame, estimate: Estimate, pose: np.ndarray, host: HostParams) -> None:
         """Take in one frame's ranges between nodes at rest, or that are not known to move. pose: (3,) on the map."""
         r = frame.frame.ranges
         moving = np.asarray(estimate.moving)
-        usable = np.asarray(r.valid) & ~(np.asarray(r.power_gap) > nlos_gap_db) & ~(moving[r.i] | moving[r.j])
+        usable = host.usable(r) & ~(moving[r.i] | moving[r.j])
         # plain numbers: a hundred of these ranges a frame are handled one by one
-        ahead, left = np.asarray(params.antenna, float).tolist()
+        ahead, left = host.antenna.tolist()
         (x, y, yaw), (vx, vy), turning = pose.tolist(), estimate.velocity.tolist(), float(estimate.yaw_rate)
         columns = (np.asarray(column)[usable].tolist() for column in (r.i, r.j, r.range, r.age))
         for a, b, distance, age in zip(*columns, strict=True):
@@ -115,45 +111,47 @@ class RangeMeans:
             heard = _Heard(frame.stamp + age * 1e9, *place, distance)
             self._open.setdefault(self.node(j), deque(maxlen=_MOST)).append(heard)
 
-    def _scatter(self, slot: int) -> float:
+    def _scatter(self, slot: int, sigma_n: float) -> float:
         """Standard deviation of a pair's newest ranges by their second differences, see keyframes [m]."""
         d = np.array(self._newest.get(slot, ()))
         if len(d) < _WINDOW:
-            return self.sigma_n
+            return sigma_n
         # the median of |x| of a normal x is 0.674 sigma, and a second difference has 6 sigma^2
         return float(np.median(np.abs(d[2:] - 2 * d[1:-1] + d[:-2])) / (0.674 * np.sqrt(6.0)))
 
-    def close(self, at: int, stamps: tuple[int, int], poses: tuple[np.ndarray, np.ndarray]) -> None:
+    def close(self, at: int, stamps: tuple[int, int], poses: tuple[np.ndarray, np.ndarray], sigma_n: float) -> None:
         """Average what was heard on the way from one keyframe to the next.
 
         Args:
-          at: number of the first. stamps [ns], poses (3,) of both.
+          at: number of the first. stamps [ns], poses (3,) of both. sigma_n: standard deviation of a range [m].
         """
         span = max(stamps[1] - stamps[0], 1)
         for node, heard in self._open.items():
-            scatter = self._scatter(node[0])
+            scatter = self._scatter(node[0], sigma_n)
             # two means in each interval: one would leave the keyframes free to move to and fro between their middles
             halves: dict[bool, list[_Heard]] = defaultdict(list)
             for one in heard:
                 halves[one.stamp - stamps[0] >= span / 2].append(one)
             for some in halves.values():
-                self.means.append((at, *node, *self._mean(stamps[0], span, poses, scatter, some)))
+                self.means.append((at, *node, *_mean(stamps[0], span, poses, (scatter, sigma_n), some)))
         self.drop()
 
     def drop(self) -> None:
         """Leave out what was heard since the last keyframe."""
         self._open.clear()
 
-    def _mean(self, start, span, poses, scatter, heard: list[_Heard]) -> tuple:
-        """The fields of MEAN from the share on."""
-        middle = sorted(one.distance for one in heard)[len(heard) // 2]  # one of them, so at least one is near it
-        ok = [one for one in heard if abs(one.distance - middle) < _WILD_M]
-        stamp, *antenna, distance = (sum(column) / len(ok) for column in zip(*ok, strict=True))
-        share = min(max((stamp - start) / span, 0.0), 1.0)
-        before, after = (_within(pose.tolist(), *antenna) for pose in poses)
-        sigma = mean_sigma(len(ok), scatter, self.sigma_n)
-        loud = sigma > mean_sigma(1, self.sigma_n, self.sigma_n)
-        return (share, before, after, distance, sigma, loud)
+
+def _mean(
+    start: int, span: int, poses: tuple[np.ndarray, np.ndarray], noise: tuple[float, float], heard: list[_Heard]
+) -> tuple:
+    """The fields of MEAN from the share on. noise: scatter of the pair's ranges, and sigma_n [m]."""
+    middle = sorted(one.distance for one in heard)[len(heard) // 2]  # one of them, so at least one is near it
+    ok = [one for one in heard if abs(one.distance - middle) < _WILD_M]
+    stamp, *antenna, distance = (sum(column) / len(ok) for column in zip(*ok, strict=True))
+    share = min(max((stamp - start) / span, 0.0), 1.0)
+    before, after = (_within(pose.tolist(), *antenna) for pose in poses)
+    sigma = mean_sigma(len(ok), *noise)
+    return share, before, after, distance, sigma, sigma > mean_sigma(1, noise[1], noise[1])
 
 
 def _within(pose: list[float], x: float, y: float) -> tuple[float, float]:

@@ -15,7 +15,6 @@ from jaxtyping import Array, Bool, Float, Int
 from uwbslam_jax.mapping import find_surface, stand_ins, undo_motion
 from uwbslam_jax.measurements import Snapshot
 from uwbslam_jax.numerics import transform_points
-from uwbslam_jax.settings import Params
 
 _POINTS = 361
 """So many points of the newer scan take part at most."""
@@ -73,9 +72,9 @@ class Registration(NamedTuple):
 
 
 @jax.jit
-def view(params: Params, snapshot: Snapshot) -> View:
-    """A scan made ready: done once, however often it is laid over others."""
-    sweep = undo_motion(snapshot.scan, params.lidar, snapshot.drift, snapshot.yaw_rate)
+def view(lidar: Float[Array, "3"], snapshot: Snapshot) -> View:
+    """A scan made ready: done once, however often it is laid over others. lidar: its pose on the robot [m, m, rad]."""
+    sweep = undo_motion(snapshot.scan, lidar, snapshot.drift, snapshot.yaw_rate)
     walls = find_surface(sweep)
     # a beam with a return speaks for itself, also where no surface was found; one without leaves it to a surface nearby
     nearest, near = stand_ins(walls.found)

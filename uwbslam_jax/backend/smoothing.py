@@ -29,6 +29,7 @@ from uwbslam_jax.numerics import (
     turned,
     wrapped,
 )
+from uwbslam_jax.settings import HostParams
 
 CALIBRATED_M = 1e-3
 """Standard deviation of a node's bias when ranges are taken to be calibrated [m]."""
@@ -70,9 +71,7 @@ def solve(
     graph: Graph,
     poses: np.ndarray,
     places: dict[Node, np.ndarray],
-    height: np.ndarray,
-    bias: np.ndarray,
-    bias_scale: float,
+    host: HostParams,
     *,
     biased: bool = False,
 ) -> Solution | None:
@@ -81,10 +80,10 @@ def solve(
     Args:
       poses: (N, 3) of the keyframes to start from [m, m, rad].
       places: resting place -> (2,) to start from [m]; others are left out.
-      height, bias: (K,) of the slots, as configured [m]. bias_scale: share of a range that is bias [m/m].
+      host: with biases and heights as configured.
       biased: whether biases were found before.
     """
-    problem = Problem.build(graph, poses, places, height, bias, bias_scale)
+    problem = Problem.build(graph, poses, places, host)
     if problem is None:
         return None
     x = problem.start(poses, places)
@@ -125,7 +124,7 @@ class Problem:
     pair_numbers: np.ndarray
 
     @staticmethod
-    def build(graph: Graph, poses, places, height, bias, bias_scale) -> Problem | None:
+    def build(graph: Graph, poses: np.ndarray, places: dict[Node, np.ndarray], host: HostParams) -> Problem | None:
         means = graph.ranges.means.values
         found, which, heard = np.unique(means[["slot", "place"]], return_inverse=True, return_counts=True)
         number = np.full(len(found), -1)
@@ -150,9 +149,8 @@ class Problem:
                 values = np.array(kept)
                 middle = float(np.median(values))
                 scatter = float(np.median(np.abs(values - middle))) / 0.674
-                d = (middle - bias[a[0]] - bias[b[0]]) / (1 + bias_scale)
-                s = mean_sigma(0.64 * len(values), scatter, graph.ranges.sigma_n)
-                pairs.append((index[a], index[b], d, height[a[0]] - height[b[0]], s))
+                s = mean_sigma(0.64 * len(values), scatter, host.sigma_n)
+                pairs.append((index[a], index[b], host.slant(middle, a[0], b[0]), host.rise(a[0], b[0]), s))
         return Problem(
             len(graph.keyframes),
             nodes,
@@ -164,8 +162,8 @@ class Problem:
             means["share"].astype(float),
             means["before"].astype(float),
             means["after"].astype(float),
-            (means["distance"].astype(float) - bias[0] - bias[slot]) / (1 + bias_scale),
-            height[0] - height[slot],
+            host.slant(means["distance"].astype(float), 0, slot),
+            host.rise(0, slot),
             sigma,
             np.array([p[:2] for p in pairs], int).reshape(-1, 2),
             np.array([p[2:] for p in pairs]).reshape(-1, 3),

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import statistics
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 
@@ -29,11 +28,9 @@ from uwbslam_jax.beacons.evidence import (
     resting_place,
 )
 from uwbslam_jax.beacons.range_table import Heard, heard
-from uwbslam_jax.estimator import Estimate, State, ranging
-from uwbslam_jax.measurements import StampedFrame
+from uwbslam_jax.estimator import Changes, Estimate, HostView, SlotEvent, State, ranging
 from uwbslam_jax.numerics import locate
 from uwbslam_jax.result import BeaconStatus, EventKind
-from uwbslam_jax.settings import Params, Settings
 
 _SILENT_S = 3.0
 _DROP_S = 60.0
@@ -64,14 +61,6 @@ _NEWEST = 4
 _WATCHED = (BeaconStatus.STATIC, BeaconStatus.MOVING, BeaconStatus.SILENT)
 
 
-class SlotEvent(NamedTuple):
-    """What happened to a slot, 0 is the robot's; detail: see result.Event."""
-
-    slot: int
-    kind: EventKind
-    detail: str = ""
-
-
 @dataclass
 class _Life:
     """What the host knows of one slot. heard: when last [s]; doubted: since when its ranges do not fit [s], None where
@@ -93,7 +82,7 @@ class _Copied:
         places, velocities = np.asarray(state.belief.mean, float)[: 4 * k].reshape(2, k, 2)
         self.places = places
         self.variance = np.max(np.diag(np.asarray(state.belief.cov, float))[: 2 * k].reshape(k, 2), axis=1)
-        self.variance[0] = 0.0  # the robot's track is taken as a whole, see beacon_state.place
+        self.variance[0] = 0.0  # the robot's track is taken as a whole, see state_edits.place
         self.rests = np.asarray(state.active) & ~np.asarray(state.moving)
         self.noise = sigma_n * ranging.loudness(np.asarray(state.scatter.log, float), np)
         self.velocities = np.where(np.asarray(state.moving)[:, None], velocities, 0.0)
@@ -103,9 +92,7 @@ class _Copied:
 class BeaconKeeper:
     """Life of all beacons; see the module's first lines."""
 
-    def __init__(self, settings: Settings):
-        self._nlos_gap_db = settings.uwb.nlos_gap_db
-        self._sigma_n = settings.uwb.sigma_n
+    def __init__(self) -> None:
         self._lives: dict[int, _Life] = {}
         self._start: int | None = None
         self._copied: _Copied | None = None
@@ -127,23 +114,22 @@ class BeaconKeeper:
         self._start = stamp if self._start is None else self._start
         return (stamp - self._start) / 1e9
 
-    def look(
-        self, state: State, params: Params, pending: list[tuple[StampedFrame, Estimate]]
-    ) -> tuple[State, list[SlotEvent]]:
-        """The state after what a few frames told about the beacons, and what happened to which slot."""
+    def look(self, view: HostView) -> Changes:
+        """What a few frames say about the beacons."""
+        state, pending, sigma_n = view.state, view.seen, view.host.sigma_n
         self._seconds(pending[0][0].stamp)  # time counts from the first frame
-        self._listen(heard(pending, params))
+        self._listen(heard(pending, view.host))
         span = self._seconds(pending[-1][0].stamp) - self._seconds(pending[0][0].stamp)
         now = self._seconds(pending[-1][0].stamp)
-        share, found = self._find_carried_robot(state, self._known(state, now, 0))
+        share, found = self._find_carried_robot(state, self._known(state, sigma_n, now, 0))
         believed = self._believes(found, share, now, [e for frame, e in pending if frame.frame.has_scan])
         if found is not None and believed:
             for life in self._lives.values():
                 life.sightings.forget(other=0)
-            return state_edits.put_robot(state, found), [SlotEvent(0, EventKind.ROBOT_CARRIED)]
+            return Changes(state_edits.put_robot(state, found), events=[SlotEvent(0, EventKind.ROBOT_CARRIED)])
         events: list[SlotEvent] = []
         for slot, life in sorted(self._lives.items()):
-            known = self._known(state, now, slot)
+            known = self._known(state, sigma_n, now, slot)
             if life.status in (BeaconStatus.WAITING, BeaconStatus.DROPPED):
                 state = self._try_to_place(state, known, slot, life, events)
             elif life.status is BeaconStatus.MOVING:
@@ -152,15 +138,15 @@ class BeaconKeeper:
                 state = self._watch(state, known, slot, life, span, events)
             trusted = life.status in (BeaconStatus.STATIC, BeaconStatus.SILENT) and life.doubted is None
             life.sightings.forget(before=now - (_WATCHED_S if trusted else MEMORY_S))
-        return state, events
+        return Changes(state, events=events)
 
-    def _known(self, state: State, now: float, slot: int) -> Known:
+    def _known(self, state: State, sigma_n: float, now: float, slot: int) -> Known:
         if self._copied is None or self._copied.of is not state:
-            self._copied = _Copied(state, self._sigma_n)
+            self._copied = _Copied(state, sigma_n)
         trusted = self._copied.rests.copy()
         trusted[self._doubted()] = False
         noise = self._copied.noise[slot]
-        return Known(self._copied.places, self._copied.variance, trusted, self._sigma_n, noise, now)
+        return Known(self._copied.places, self._copied.variance, trusted, sigma_n, noise, now)
 
     def _doubted(self) -> list[int]:
         return [slot for slot, life in self._lives.items() if life.doubted is not None]
@@ -179,8 +165,6 @@ class BeaconKeeper:
 
     def _listen(self, ranges: Heard) -> None:
         """Remember each usable range to a node of known place."""
-        kept = ~(ranges.power_gap > self._nlos_gap_db)
-        ranges = ranges._replace(**{name: column[kept] for name, column in ranges._asdict().items()})
         time = (ranges.stamp - (self._start or 0)) / 1e9
         columns = [time + ranges.age, ranges.i, *ranges.antenna.T, ranges.flat, ranges.normalised]
         for node, other, usable in ((ranges.i, ranges.j, ranges.rests_j), (ranges.j, ranges.i, ranges.rests_i)):
@@ -303,8 +287,8 @@ class BeaconKeeper:
             return share, None
         anchors, distance = np.concatenate(rows)[:, :2], np.concatenate(rows)[:, 2]
         # the newest ranges were taken on the move: a few decimetres are as good as they get
-        found = locate(anchors, distance, np.full(len(distance), 2 * self._sigma_n))
+        found = locate(anchors, distance, np.full(len(distance), 2 * known.sigma_n))
         if found is None or np.linalg.norm(found[0] - known.places[0]) < _CARRIED_M:
             return share, None
         left = np.abs(np.linalg.norm(anchors - found[0], axis=1) - distance)
-        return share, found[0] if np.mean(left < _MISFIT * self._sigma_n) > _FOUND_SHARE else None
+        return share, found[0] if np.mean(left < _MISFIT * known.sigma_n) > _FOUND_SHARE else None

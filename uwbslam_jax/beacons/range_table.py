@@ -9,18 +9,18 @@ import numpy as np
 
 from uwbslam_jax.estimator import Estimate
 from uwbslam_jax.measurements import StampedFrame
-from uwbslam_jax.settings import Params
+from uwbslam_jax.numerics import turned
+from uwbslam_jax.settings import HostParams
 
 
 class Heard(NamedTuple):
-    """R valid ranges in order of their frames.
+    """R usable ranges in order of their frames.
 
     Attributes:
       frame: (R,) number of the frame.
       stamp: (R,) of the frame, int64 [ns]. age: (R,) of the range relative to it [s].
       i, j: (R,) slots.
       flat: (R,) distance in the plane, biases and heights taken off [m].
-      power_gap: (R,) [dB].
       normalised: (R,) see Estimate.
       antenna: (R, 2) where the robot's antenna was [m].
       rests_i, rests_j: (R,) whether the node is in the state and not carried.
@@ -32,17 +32,15 @@ class Heard(NamedTuple):
     i: np.ndarray
     j: np.ndarray
     flat: np.ndarray
-    power_gap: np.ndarray
     normalised: np.ndarray
     antenna: np.ndarray
     rests_i: np.ndarray
     rests_j: np.ndarray
 
 
-def heard(pending: Sequence[tuple[StampedFrame, Estimate]], params: Params) -> Heard:
-    """The valid ranges of some frames and their estimates, all on the host."""
-    valid = np.stack([frame.frame.ranges.valid for frame, _ in pending])
-    f, k = np.nonzero(valid)
+def heard(pending: Sequence[tuple[StampedFrame, Estimate]], host: HostParams) -> Heard:
+    """The usable ranges of some frames and their estimates, all on the host."""
+    f, k = np.nonzero(np.stack([host.usable(frame.frame.ranges) for frame, _ in pending]))
 
     def of_ranges(name: str) -> np.ndarray:
         return np.stack([getattr(frame.frame.ranges, name) for frame, _ in pending])[f, k]
@@ -52,8 +50,6 @@ def heard(pending: Sequence[tuple[StampedFrame, Estimate]], params: Params) -> H
 
     i, j, age = of_ranges("i"), of_ranges("j"), of_ranges("age").astype(float)
     pose, velocity, yaw_rate = (of_estimates(name).astype(float)[f] for name in ("pose", "velocity", "yaw_rate"))
-    height, bias = np.asarray(params.height, float), np.asarray(params.bias, float)
-    slant = (of_ranges("range").astype(float) - bias[i] - bias[j]) / (1.0 + float(params.bias_scale))
     rests = of_estimates("active") & ~of_estimates("moving")
     return Heard(
         frame=f,
@@ -61,17 +57,9 @@ def heard(pending: Sequence[tuple[StampedFrame, Estimate]], params: Params) -> H
         age=age,
         i=i,
         j=j,
-        flat=np.sqrt(np.maximum(slant**2 - (height[i] - height[j]) ** 2, 0.01)),
-        power_gap=of_ranges("power_gap"),
+        flat=host.flat(of_ranges("range").astype(float), i, j),
         normalised=of_estimates("normalised").astype(float)[f, k],
-        antenna=_antenna(pose, velocity, yaw_rate, age, params),
+        antenna=pose[:, :2] + age[:, None] * velocity + turned(pose[:, 2] + yaw_rate * age, host.antenna),
         rests_i=rests[f, i],
         rests_j=rests[f, j],
     )
-
-
-def _antenna(pose, velocity, yaw_rate, age, params) -> np.ndarray:
-    heading = pose[:, 2] + yaw_rate * age
-    x, y = np.asarray(params.antenna, float)
-    c, s = np.cos(heading), np.sin(heading)
-    return pose[:, :2] + age[:, None] * velocity + np.stack([c * x - s * y, s * x + c * y], axis=1)

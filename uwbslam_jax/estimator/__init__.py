@@ -9,6 +9,12 @@ from uwbslam_jax.estimator import (
     state_vector as state_vector,
 )
 from uwbslam_jax.estimator.compiled import CompileClock as CompileClock
+from uwbslam_jax.estimator.host_view import (
+    Changes as Changes,
+    HostView as HostView,
+    Moved as Moved,
+    SlotEvent as SlotEvent,
+)
 from uwbslam_jax.estimator.published_frame import (
     anchored as anchored,
     frame_motion as frame_motion,

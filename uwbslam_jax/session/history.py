@@ -9,11 +9,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from uwbslam_jax.estimator import Estimate, map_pose, sight
+from uwbslam_jax.estimator import Estimate, Moved, map_pose, sight
 from uwbslam_jax.measurements import StampedFrame
-from uwbslam_jax.numerics import Column, carried_along
+from uwbslam_jax.numerics import Column, rotation_matrix
 from uwbslam_jax.result import Event, EventKind
-from uwbslam_jax.startup import Adopted
 
 _RESIDUALS_EVERY_S = 1.0
 """Of each pair one is kept this often: frames at fixed times would see the same pairs again and again, or none."""
@@ -48,7 +47,6 @@ class History:
       diagnostics: one entry a frame by name.
       residuals: (t, slot, slot, measured minus predicted); tracks: (t, slot, x, y, sigma).
       events: in order of time.
-      left: beacons as they were when one of them last left the state, see `beacons`.
       last_scan: number, frame and estimate of the last frame that had a scan.
     """
 
@@ -66,19 +64,13 @@ class History:
         self.last_scan: tuple[int, StampedFrame, Estimate] | None = None
         self._residuals_at: dict[tuple[int, int], int] = {}
         self._tracks_at = 0
-        self.left: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self._left: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         self._seen: Estimate | None = None
 
     @property
     def beacons(self) -> dict[int, tuple[np.ndarray, np.ndarray]]:
         """Slot -> position (2,) [m] and covariance (2, 2) [m^2] when it was last in the state."""
-        self._keep_beacons()
-        return self.left
-
-    def _keep_beacons(self) -> None:
-        if self._seen is not None:
-            for slot in np.flatnonzero(self._seen.active[1:]) + 1:
-                self.left[int(slot)] = np.array(self._seen.beacons[slot]), np.array(self._seen.beacon_covs[slot])
+        return self._left | _in_state(self._seen)
 
     @property
     def diagnostics(self) -> dict[str, np.ndarray]:
@@ -137,7 +129,7 @@ class History:
                 sigma = float(np.sqrt(max(np.linalg.eigvalsh(estimate.beacon_covs[slot])[-1], 0.0)))
                 self.tracks.append((frame.stamp, slot, x, y, sigma))
         if self._seen is None or (estimate.active != self._seen.active).any():
-            self._keep_beacons()
+            self._left |= _in_state(self._seen)
         self._seen = estimate
         if frame.frame.has_scan:
             self.last_scan = (number, frame, estimate)
@@ -147,20 +139,25 @@ class History:
         return np.array(self.stamps), np.array(self.map_poses, float), np.array(self.sight)
 
     def event(self, stamp: int, kind: EventKind, node: int | None = None, detail: str = "") -> None:
-        """Something worth telling happened, see Event."""
+        """Something worth reporting happened, see Event."""
         self.events.append(Event(stamp, kind, node, detail))
 
-    def carry_along(self, anchors: np.ndarray, before: np.ndarray, after: np.ndarray) -> None:
-        """The map was corrected: its keyframes, at anchors (N,) [ns], moved from before (N, 3) to after. What was
-        published stays."""
-        moved = carried_along(self.stamps.values, self.map_poses.values, anchors, before, after)
-        self.map_poses.values[:] = moved
+    def carry_along(self, moved: Moved, *, republish: bool) -> None:
+        """The map was drawn anew. What was published stays, unless the published frame was only now decided: then what
+        was reported in the start frame is put into it."""
+        stamps, turn = self.stamps.values, moved.turn
+        self.map_poses.values[:] = moved.carry(stamps, self.map_poses.values)
+        if republish:
+            self.poses.values[:] = moved.carry(stamps, self.poses.values)
+            self.sight.values[:] += turn
+            R = np.eye(3)
+            R[:2, :2] = rotation_matrix(turn)
+            self.covs.values[:] = R @ self.covs.values @ R.T
 
-    def republish(self, adopted: Adopted) -> None:
-        """The frame was decided: what was reported in the start frame is put into the published one."""
-        self.poses.values[:] = adopted.republish(self.stamps.values, self.poses.values)
-        self.map_poses.values[:] = adopted.republish(self.stamps.values, self.map_poses.values)
-        self.sight.values[:] += adopted.turn
-        c, s = np.cos(adopted.turn), np.sin(adopted.turn)
-        R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-        self.covs.values[:] = R @ self.covs.values @ R.T
+
+def _in_state(estimate: Estimate | None) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+    """Slot -> position and covariance of the beacons that are in the state."""
+    if estimate is None:
+        return {}
+    slots = (np.flatnonzero(estimate.active[1:]) + 1).tolist()
+    return {slot: (np.array(estimate.beacons[slot]), np.array(estimate.beacon_covs[slot])) for slot in slots}

@@ -219,7 +219,7 @@ def _summary(session: Session, facts: Facts) -> dict[str, Any]:
         "searches": total.get("searched", 0),
         "keyframes": len(session.graph.keyframes),
         "scans_laid_over_others": len(session.graph.edges),
-        "revisions": {"solved": session.revisions, "taken_over": session.taken_over},
+        "revisions": {"solved": session.back_end.revisions, "taken_over": session.back_end.taken_over},
         "events": [[round((e.stamp - int(stamps[0])) / 1e9, 3), e.text] for e in history.events],
         "ranges_used": used,
         "ranges_rejected": rejected,

@@ -147,7 +147,7 @@ class Runner:
         if self.session.status is RunStatus.WAITING:
             ids = self.session.ids
             for frame in frames:
-                self._links.hear(frame, ids, self.session.params, self.session.config.nlos_gap_db)
+                self._links.hear(frame, ids, self.session.host)
         return updates
 
 

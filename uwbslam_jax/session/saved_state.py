@@ -23,7 +23,7 @@ from uwbslam_jax.estimator import State, init
 from uwbslam_jax.mapping import Tiles
 from uwbslam_jax.measurements import RangeMessage
 from uwbslam_jax.numerics import Gaussian, locate
-from uwbslam_jax.settings import Settings, make_config, make_params
+from uwbslam_jax.settings import Settings, make_config, make_host_params, make_params
 
 FILE = "state.npz"
 _VERSION = 1
@@ -105,13 +105,9 @@ class Locator:
     """Where a robot is among saved beacons, by its first ranges."""
 
     def __init__(self, saved: Saved, settings: Settings):
-        params = make_params(settings, saved.slots)
-        self._robot, self._sigma = settings.robot.id, settings.uwb.sigma_n
-        self._slots, self._bias = saved.slots, np.array(params.bias, float)
-        for slot, bias in saved.found_bias.items():
-            self._bias[slot] += bias
-        self._height, self._scale = np.asarray(params.height, float), float(params.bias_scale)
-        self._places = np.asarray(saved.state.belief.mean, float)[: 2 * len(self._bias)].reshape(-1, 2)
+        self._host = make_host_params(settings, make_params(settings, saved.slots, saved.found_bias))
+        self._slots = saved.slots
+        self._places = np.asarray(saved.state.belief.mean, float)[: 2 * len(self._host.bias)].reshape(-1, 2)
         self._known = np.asarray(saved.state.active) & ~np.asarray(saved.state.moving)
         self._heard: list[tuple[int, int, float]] = []
         self._since: int | None = None
@@ -126,11 +122,8 @@ class Locator:
         self._heard = [entry for entry in self._heard if stamp - entry[0] < _WINDOW_S * 1e9]
         if len({slot for _, slot, _ in self._heard}) >= _FEWEST and stamp - self._heard[0][0] > 0.6 * _WINDOW_S * 1e9:
             slot = np.array([entry[1] for entry in self._heard])
-            slant = (np.array([entry[2] for entry in self._heard]) - self._bias[slot] - self._bias[0]) / (
-                1 + self._scale
-            )
-            flat = np.sqrt(np.maximum(slant**2 - (self._height[slot] - self._height[0]) ** 2, 0.01))
-            found = locate(self._places[slot], flat, np.full(len(flat), 2 * self._sigma))
+            flat = np.asarray(self._host.flat(np.array([entry[2] for entry in self._heard]), slot, 0))
+            found = locate(self._places[slot], flat, np.full(len(flat), 2 * self._host.sigma_n))
             if found is not None:
                 return found[0]
         return self._places[0].copy() if stamp - self._since > _PATIENCE_S * 1e9 else None

@@ -1,62 +1,35 @@
-"""One run of the estimator over frames: the compiled step, and the host's slow loop around it.
+"""One run of the estimator over frames: the compiled step, and the host's look at what the steps reported.
 
-Every CONTROL_EVERY frames the host looks at what the steps reported: it decides the start-up, places beacons that
-joined, drops those that fell silent, and moves the map's window. The steps in between run without it, one by one
-(online) or ten at a time (batch); it is the same compiled program, and gives the same bits.
+Every CONTROL_EVERY frames the host's parts look: start-up until the published frame is decided, then the keeper of the
+beacons and the back end. What they return is applied here, and nowhere else. The steps in between run without them, one
+by one (online) or ten at a time (batch); it is the same compiled program, and gives the same bits.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from functools import partial
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from uwbslam_jax.backend import (
-    Graph,
-    Hindsight,
-    Node,
-    Question,
-    RangeMeans,
-    Reviser,
-    Revision,
-    Solution,
-    is_news,
-    look_back,
-    take_over,
-)
+from uwbslam_jax.backend import BackEnd, Graph, Hindsight, notable
 from uwbslam_jax.beacons import MEMORY_S, BeaconKeeper
-from uwbslam_jax.estimator import Estimate, compiled, init, state_vector
-from uwbslam_jax.mapping import Tiles, redraw
+from uwbslam_jax.estimator import Changes, Estimate, HostView, compiled, init
+from uwbslam_jax.mapping import Tiles
 from uwbslam_jax.measurements import StampedFrame
 from uwbslam_jax.result import BeaconStatus, EventKind, MapImage, RunStatus
 from uwbslam_jax.session import saved_state
 from uwbslam_jax.session.history import History
 from uwbslam_jax.session.saved_state import Saved
 from uwbslam_jax.session.update import Update
-from uwbslam_jax.settings import Params, Settings, make_config, make_params
-from uwbslam_jax.startup import Buffer, adopt, decide
+from uwbslam_jax.settings import HostParams, Params, Settings, make_config, make_host_params, make_params
+from uwbslam_jax.startup import StartUp
 
 CONTROL_EVERY = compiled.GROUP
-"""Frames between two looks of the host."""
-_NOTABLE_BIAS = 0.3
-"""A bias larger than this share of sigma_n is told; smaller ones only take up what little was learnt of them."""
-_SOLVE_EVERY_S = 1.0
-"""The start-up problem is solved at most this often, in the log's time."""
-_ELSEWHERE = (
-    EventKind.ROBOT_CARRIED,
-    EventKind.PLACED_MOVING,
-    EventKind.CARRIED,
-    EventKind.PUT_DOWN,
-    EventKind.MOVED,
-    EventKind.LOST_MOVING,
-    EventKind.SILENT_MOVING,
-    EventKind.DROPPED,
-)
-"""After these a node is not where it was. One that is only doubted may be: walls or a clock explain its ranges too."""
+"""Frames between two looks of the host: as many as the compiled step takes at once."""
+Seen = Sequence[tuple[StampedFrame, Estimate]]
+"""Frames and what the steps made of them."""
 
 
 class Session:
@@ -64,13 +37,11 @@ class Session:
 
     Attributes:
       settings, config, params: what it runs with; params grow biases and heights as ids get slots.
-      state: the estimator's.
+      state, tiles: the estimator's, and what of its map lies outside the window.
       decided_at: stamp of the frame at which the published frame was decided, None before [ns].
-      status: of the start-up.
+      status: of the start-up. hypotheses: explanations of the start that are alive.
       found_bias: slot -> range bias that was found beyond the configured one [m]; empty where there is none.
-      history: what was reported so far.
-      graph: what the run as a whole is solved from. hindsight: its solution once the run is over, else None.
-      taken_over: how often the state was corrected by the run so far, solved as a whole.
+      history: what was reported so far. back_end: what the run as a whole is solved by.
       listener: called with each update when stepped frame by frame, before the host has its look.
       fixed: whether map and beacons are taken as they are: the run only localises.
     """
@@ -91,17 +62,17 @@ class Session:
         self.fixed = False
         self._slots: dict[int, int] = {settings.robot.id: 0}
         self._pending: list[tuple[StampedFrame, Estimate]] = []
-        self._solved_at = self._solved_with = 0
-        self._buffer = self._new_buffer()
-        self._keeper = BeaconKeeper(settings)
-        self.graph = Graph(RangeMeans(settings.uwb.sigma_n))
-        self.hindsight: Hindsight | None = None
-        self._looks_back = settings.filter.preset == "robust" and not settings.filter.lidar_only
-        self._reviser = Reviser()
-        self.taken_over = 0
-        self._places: dict[Node, np.ndarray] = {}
-        self._frame_nodes: tuple[Node, Node] = ((0, 0), (0, 0))
-        self._copied: tuple[Params | None, Params] = (None, self.params)
+        self._on_host: tuple[Params | None, HostParams] = (None, make_host_params(settings, self.params))
+        self._start_up = StartUp(self.host)
+        self._keeper = BeaconKeeper()
+        self.back_end = BackEnd(settings)
+
+    @property
+    def host(self) -> HostParams:
+        """The parameters that are in use now, on the host."""
+        if self._on_host[0] is not self.params:
+            self._on_host = (self.params, make_host_params(self.settings, self.params))
+        return self._on_host[1]
 
     @property
     def slots(self) -> dict[int, int]:
@@ -114,15 +85,23 @@ class Session:
         return {slot: node for node, slot in self._slots.items()}
 
     @property
-    def revisions(self) -> int:
-        """How often the run so far was solved as a whole."""
-        return self._reviser.solved
+    def graph(self) -> Graph:
+        """What the run as a whole is solved from."""
+        return self.back_end.graph
+
+    @property
+    def hindsight(self) -> Hindsight | None:
+        """The run solved as a whole once it is over, None before and where there is too little of it."""
+        return self.back_end.hindsight
 
     @property
     def biased(self) -> bool:
-        """Whether a bias was found that is worth a user's while."""
-        worth = _NOTABLE_BIAS * self.settings.uwb.sigma_n
-        return any(abs(found) > worth for found in self.found_bias.values())
+        """Whether a bias was found that is worth reporting."""
+        return notable(self.found_bias, self.settings.uwb.sigma_n)
+
+    def beacon_status(self, slot: int) -> BeaconStatus:
+        """Of a beacon now; never RELATIVE."""
+        return self._keeper.status(slot)
 
     def room(self) -> int:
         """How many more frames may be stepped before the host has to look."""
@@ -172,177 +151,77 @@ class Session:
           place: (2,) where the robot is now [m]. stamp: of the moment [ns].
           fixed: map and beacons stay as they are.
         """
-        state = saved_state.resumed(saved, place, fixed=fixed)
-        self.state, self.tiles, self._slots = state, saved.tiles.copy(), dict(saved.slots)
+        self.state = saved_state.resumed(saved, place, fixed=fixed)
+        self.tiles, self._slots = saved.tiles.copy(), dict(saved.slots)
         self.found_bias, self.fixed = dict(saved.found_bias), fixed
         self.history.event(stamp, EventKind.LOCALISING if fixed else EventKind.RESUMED)
         self.config = make_config(self.settings)
-        self.params = self._biased(make_params(self.settings, self._slots))
-        self.decided_at = stamp
-        self._looks_back = False  # the scans that the saved map was drawn from are gone
-        self.status, self.hypotheses = RunStatus.DECIDED, 1
-        for slot in np.flatnonzero(np.asarray(state.active))[1:]:
+        self.params = make_params(self.settings, self._slots, self.found_bias)
+        self.decided_at, self.status, self.hypotheses = stamp, RunStatus.DECIDED, 1
+        self.back_end.enabled = False  # the scans that the saved map was drawn from are gone
+        for slot in np.flatnonzero(np.asarray(self.state.active))[1:]:
             self._keeper.placed(int(slot), stamp)
 
     def finish(self) -> None:
-        """The last look, over the frames since the one before."""
+        """The last look, over the frames since the one before, and the run solved as a whole."""
         if self._pending:
             self._look()
-        self._reviser.close()
-        question = self._question()
-        self.hindsight = None if question is None else look_back(question, *self.history.passage())
-        if self.hindsight is None:
-            return
-        self._learn_biases(self.hindsight.solution, int(self.history.stamps[-1]))
-        solution = self.hindsight.solution
-        seen = self.graph.seen(solution.poses)
-        grid = redraw(self.config, self.params, self.tiles, seen, self.hindsight.track[-1, :2])
-        self._take_over(Revision(solution, grid, self.tiles))
-
-    def _question(self) -> Question | None:
-        """What to solve of the run so far. Its graph is the one that grows."""
-        if self.decided_at is None or not self._looks_back:
-            return None
-        positions = np.asarray(state_vector.unpack(self.state.belief.mean).positions, float)
-        resting = np.asarray(self.state.active) & ~np.asarray(self.state.moving)
-        places = self._places | {
-            self.graph.ranges.node(slot): positions[slot] for slot in map(int, np.flatnonzero(resting)) if slot > 0
-        }
-        poses = self.history.poses[self.graph.keyframes["frame"]].astype(float)
-        configured = make_params(self.settings, self._slots)
-        return Question(self.graph, poses, places, configured, self._frame_nodes, bool(self.found_bias))
+        changes = self.back_end.finish(self._view([]), *self.history.passage())
+        self._apply(changes, int(self.history.stamps[-1]) if len(self.history.stamps) else 0)
 
     def _learn_slots(self, frame: StampedFrame) -> None:
         if len(frame.slots) > len(self._slots):
             self._slots = dict(frame.slots)
-            self.params = self._biased(make_params(self.settings, self._slots))
-            self._buffer.height, self._buffer.bias = np.asarray(self.params.height), np.asarray(self.params.bias)
-
-    def _biased(self, params: Params) -> Params:
-        """Parameters with the biases that were found added to the configured ones."""
-        bias = np.array(params.bias)
-        for slot, found in self.found_bias.items():
-            bias[slot] += found
-        return params._replace(bias=jnp.asarray(bias, jnp.float32))
-
-    def _new_buffer(self) -> Buffer:
-        p = self.params
-        antenna, height, bias = np.asarray(p.antenna, float), np.asarray(p.height), np.asarray(p.bias)
-        return Buffer(antenna, height, bias, float(p.sigma_n), float(p.bias_scale))
+            self.params = make_params(self.settings, self._slots, self.found_bias)
 
     def _take(self, frame: StampedFrame, estimate: Estimate) -> None:
-        if self._looks_back:
-            # not with the look: what that takes comes on top for one frame in ten
-            self.graph.add(
-                self.config, self._params_on_host(), len(self.history.stamps) + len(self._pending), frame, estimate
-            )
+        self.back_end.add(self.host, len(self.history.stamps) + len(self._pending), frame, estimate)
         self._pending.append((frame, estimate))
         if len(self._pending) == CONTROL_EVERY:
             self._look()
 
+    def _view(self, seen: Seen) -> HostView:
+        """The run as its parts see it."""
+        history = self.history
+        shown = self.config, self.params, self.host, self.state, self.tiles, self._slots, seen
+        return HostView(*shown, history.poses.values, history.beacons, self.found_bias)
+
     def _look(self) -> None:
-        pending, self._pending = self._pending, []
-        self.history.add(pending, self.hypotheses)
-        if not self.settings.filter.lidar_only:
-            if self.decided_at is None:
-                self._start_up(pending)
-            else:
-                self._keep_beacons(pending)
+        seen, self._pending = self._pending, []
+        now = seen[-1][0].stamp
+        self.history.add(seen, self.hypotheses)
+        if self.settings.filter.lidar_only:
+            pass
+        elif self.decided_at is None:
+            self._apply(self._start_up.look(self._view(seen)), now)
+        else:
+            changes = self._keeper.look(self._view(seen))
+            self._apply(changes, now)
+            since = now - round(MEMORY_S * 1e9)
+            self._apply(self.back_end.look(self._view(seen), changes.events, since), now)
         robot = np.asarray(self.state.belief.mean)[:2].astype(float)
         origin = np.asarray(self.state.grid.origin, float)
         if self.tiles.needs_move(origin, self.config.cells, robot):
             self.state = self.state._replace(grid=self.tiles.recentre(self.state.grid, robot))
 
-    def _start_up(self, pending: list[tuple[StampedFrame, Estimate]]) -> None:
-        for frame, estimate in pending:
-            self._buffer.add(frame, estimate, decide.usable(frame.frame.ranges, self.config.nlos_gap_db))
-        now = pending[-1][0].stamp
-        if now - self._solved_at < _SOLVE_EVERY_S * 1e9 or self._buffer.newest == self._solved_with:
-            return  # nothing can have been learnt but better averages
-        self._solved_at, self._solved_with = now, self._buffer.newest
+    def _apply(self, changes: Changes, now: int) -> None:
+        """What a part has found becomes the run's."""
+        if changes.state is not None:
+            self.state = changes.state
+        if changes.tiles is not None:
+            self.tiles = changes.tiles
+        if changes.bias is not None:
+            self.found_bias = changes.bias
+            self.params = make_params(self.settings, self._slots, self.found_bias)
+        if changes.status is not None and changes.hypotheses is not None:
+            self.status, self.hypotheses = changes.status, changes.hypotheses
+        if changes.moved is not None:
+            self.history.carry_along(changes.moved, republish=changes.frame_slots is not None)
         ids = self.ids
-        outcome = decide.solve(self._buffer, ids)
-        if outcome.status != self.status:
-            self.history.event(now, EventKind.STATUS, detail=outcome.status)
-        self.status, self.hypotheses = outcome.status, outcome.hypotheses
-        if outcome.placement is None:
-            return
-        origin, along = decide.choose_frame(outcome.placement, ids)
-        if outcome.biased:
-            nodes = [0, *outcome.placement.slots]
-            self.found_bias = dict(zip(nodes, map(float, outcome.placement.bias), strict=True))
-            self.params = self._biased(make_params(self.settings, self._slots))
-        adopted = adopt(
-            self.config, self.params, self.state, self.tiles, self._buffer, outcome.placement, (origin, along)
-        )
-        self.state, self.decided_at = adopted.state, now
-        self.config = make_config(self.settings)
-        self._frame_nodes = self.graph.ranges.node(origin), self.graph.ranges.node(along)
-        self.history.republish(adopted)
-        self.graph.put(adopted.republish(self.graph.stamps(), self.graph.poses()), adopted.turn)
-        self.history.event(now, EventKind.FRAME_DECIDED, detail=f"{ids[origin]} and {ids[along]}")
-        for slot in outcome.placement.slots:
-            self._keeper.placed(slot, now)
-            self.history.event(now, EventKind.PLACED, ids[slot])
-        self._buffer = self._new_buffer()
-
-    def _keep_beacons(self, pending: list[tuple[StampedFrame, Estimate]]) -> None:
-        ids = self.ids
-        params = self._params_on_host()
-        self.state, events = self._keeper.look(self.state, params, pending)
-        for slot, kind, detail in events:
-            self.history.event(pending[-1][0].stamp, kind, ids[slot] if slot else None, detail)
-            self._remember(slot, kind, pending[-1][0].stamp)
-        if any(event.kind is EventKind.ROBOT_CARRIED for event in events):
-            self._reviser.drop()
-        self._revise(pending[-1][0].stamp)
-
-    def _params_on_host(self) -> Params:
-        if self._copied[0] is not self.params:
-            self._copied = (self.params, jax.device_get(self.params))
-        return self._copied[1]
-
-    def _remember(self, slot: int, kind: EventKind, now: int) -> None:
-        """What an event means for the run as a whole."""
-        if kind is EventKind.PLACED:
-            self.graph.placed(slot, now - round(MEMORY_S * 1e9))
-        elif kind in _ELSEWHERE:
-            if slot in self.history.beacons:
-                self._places[self.graph.ranges.node(slot)] = np.asarray(self.history.beacons[slot][0], float)
-            self.graph.moved(slot)
-
-    def _revise(self, now: int) -> None:
-        """Take over what the run so far tells, where the state contradicts it; begin to ask again."""
-        revision = self._reviser.look(
-            partial(is_news, state=self.state, graph=self.graph, learnt=bool(self.found_bias))
-        )
-        if revision is not None:
-            self._learn_biases(revision.solution, now)
-            self._take_over(revision)
-            self.taken_over += 1
-            self.history.event(now, EventKind.CORRECTED)
-        if self._looks_back and self._reviser.wants(len(self.graph.keyframes)):
-            question = self._question()
-            if question is not None:
-                question = question._replace(graph=self.graph.copy())
-                epoch = float(self.state.map_spread.way)
-                self._reviser.begin(self.config, self.params, question, self.settings.map.resolution, epoch)
-
-    def _take_over(self, revision: Revision) -> None:
-        anchors, before = self.graph.stamps(), self.graph.poses()
-        self.state = take_over(self.config, self.params, revision, self.state, self.graph)
-        self.tiles = revision.tiles
-        self.history.carry_along(anchors, before, self.graph.poses())
-
-    def _learn_biases(self, solution: Solution, now: int) -> None:
-        if not solution.biased:
-            return
-        told = self.biased
-        self.found_bias = solution.bias
-        if self.biased and not told:
-            self.history.event(now, EventKind.BIASED)
-        self.params = self._biased(make_params(self.settings, self._slots))
-
-    def beacon_status(self, slot: int) -> BeaconStatus:
-        """Of a beacon now; never RELATIVE."""
-        return self._keeper.status(slot)
+        for slot, kind, detail in changes.events:
+            self.history.event(now, kind, ids[slot] if slot else None, detail)
+        if changes.frame_slots is not None and changes.moved is not None:
+            self.decided_at, self.config = now, make_config(self.settings)
+            self.back_end.publish(changes.frame_slots, changes.moved)
+            for slot in np.flatnonzero(np.asarray(self.state.active))[1:]:
+                self._keeper.placed(int(slot), now)

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
 
-from uwbslam_jax.estimator import State, anchored, frame_motion, published, state_vector
+from uwbslam_jax.estimator import HostView, Moved, State, anchored, frame_motion, published, state_vector
 from uwbslam_jax.mapping import Tiles, redraw
-from uwbslam_jax.numerics import between, carried_along, compose, numeric_jacobian
-from uwbslam_jax.settings import Config, Params
+from uwbslam_jax.numerics import between, compose, numeric_jacobian
 from uwbslam_jax.startup.keyframe_buffer import Buffer
 from uwbslam_jax.startup.placement import Placement
 
@@ -22,46 +20,17 @@ def _last_and_beacons(placement: Placement) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([placement.poses[-1], placement.beacons.ravel()]), placement.cov[last:, last:]
 
 
-@dataclass(frozen=True)
-class Adopted:
-    """A start-up that was decided.
-
-    Attributes:
-      state: the estimator's state in the published frame.
-      anchors: (N,) stamps of the keyframes [ns]; before, after: (N, 3) their poses in the start frame and in the
-        published one. A pose of the start moves with the keyframes before and after it.
-    """
-
-    state: State
-    anchors: np.ndarray
-    before: np.ndarray
-    after: np.ndarray
-
-    def republish(self, stamps: np.ndarray, poses: np.ndarray) -> np.ndarray:
-        """Poses (T, 3) of the start frame, taken at stamps (T,) [ns], in the published frame."""
-        return carried_along(stamps, poses, self.anchors, self.before, self.after)
-
-    @property
-    def turn(self) -> float:
-        """Of the published frame against the start frame [rad]."""
-        return float(self.after[-1, 2] - self.before[-1, 2])
-
-
 def adopt(
-    config: Config,
-    params: Params,
-    state: State,
-    tiles: Tiles,
-    buffer: Buffer,
-    placement: Placement,
-    frame_slots: tuple[int, int],
-) -> Adopted:
-    """The state in the paper's frame (one beacon at the origin, another on +x), its covariance carried along.
+    view: HostView, buffer: Buffer, placement: Placement, frame_slots: tuple[int, int]
+) -> tuple[State, Tiles, Moved]:
+    """The state in the paper's frame (one beacon at the origin, another on +x), its covariance carried along; the map,
+    drawn again; and how the keyframes have moved from the start frame into the published one.
 
     Args:
-      state: of the LiDAR-only run in the start frame; tiles: what of its map lies outside the window.
+      view: of the LiDAR-only run in the start frame.
       frame_slots: slots of the two beacons that make the frame.
     """
+    config, state, tiles = view.config, view.state, Tiles(view.tiles.resolution)
     keys = buffer.track()
     before = np.array([key.pose for key in keys])
     pose = np.asarray(state_vector.robot_pose(state.belief.mean), float)
@@ -75,7 +44,7 @@ def adopt(
     belief = anchored(state.belief, config.nodes, y(x), cov, placement.slots, pose)
     active = jnp.zeros(config.nodes, bool).at[jnp.array([0, *placement.slots])].set(True)
     seen = [(pose, key.snapshot()) for pose, key in zip(after, keys, strict=True) if bool(key.frame.frame.has_scan)]
-    grid = redraw(config, params, tiles, seen, y(x)[:2])
+    grid = redraw(config, view.params, tiles, seen, y(x)[:2])
     adopted = state._replace(
         belief=belief,
         active=active,
@@ -85,4 +54,4 @@ def adopt(
         map_spread=state.map_spread._replace(epoch=jnp.ones(())),
         drawn_pose=jnp.asarray(y(x)[:3], jnp.float32),
     )
-    return Adopted(adopted, np.array([key.frame.stamp for key in keys]), before, after)
+    return adopted, tiles, Moved(np.array([key.frame.stamp for key in keys]), before, after)

@@ -13,7 +13,6 @@ from functools import partial
 import numpy as np
 
 from uwbslam_jax.estimator import published
-from uwbslam_jax.measurements import Ranges
 from uwbslam_jax.numerics import CALIBRATED_M, DECIDED, SIGMA_ENOUGH_M, largest_sigma, numeric_jacobian
 from uwbslam_jax.result import RunStatus
 from uwbslam_jax.startup.adopt import _last_and_beacons
@@ -31,11 +30,6 @@ _UNDRAWN_SIGMA = 0.05
 """The same without a map [rad], and for positions as a share of the distance between beacons."""
 _UNDRAWN_WAIT_S = 60.0
 """Without a map so long is waited for beacons that are not yet certain: placed together they are placed best."""
-
-
-def usable(ranges: Ranges, nlos_gap_db: float) -> np.ndarray:
-    """(M,) which ranges of a frame start-up may use: measured, and not NLOS by their powers."""
-    return np.asarray(ranges.valid) & ~(np.asarray(ranges.power_gap) > nlos_gap_db)
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uwbslam_jax.measurements import Ranges, Snapshot, StampedFrame
+from uwbslam_jax.estimator import Estimate
+from uwbslam_jax.measurements import Snapshot, StampedFrame
 from uwbslam_jax.numerics import mean_sigma, turned
+from uwbslam_jax.settings import HostParams
 
 _MOVED = (0.25, 0.2)
 """A keyframe every so much of path or turn [m, rad]."""
@@ -93,17 +95,14 @@ class Buffer:
 
     Attributes:
       keyframes: kept so far. sightings: slot -> ranges of the robot to it; pairs: (i, j) -> ranges between beacons.
-      antenna: (2,) on the robot [m]; height, bias: (K,) [m]; sigma_n [m]; bias_scale [m/m].
+      host: what a range is taken for; grows as ids get slots.
     """
 
-    def __init__(
-        self, antenna: np.ndarray, height: np.ndarray, bias: np.ndarray, sigma_n: float, bias_scale: float = 0.0
-    ):
+    def __init__(self, host: HostParams):
         self.keyframes: list[Keyframe] = []
         self.sightings: dict[int, deque[Sighting]] = {}
         self.pairs: dict[tuple[int, int], deque[float]] = {}
-        self.antenna, self.height, self.bias, self.sigma_n = antenna, height, bias, sigma_n
-        self.bias_scale = bias_scale
+        self.host = host
         self._latest: Keyframe | None = None
         self._odometry = True
 
@@ -125,13 +124,8 @@ class Buffer:
             return list(self.keyframes)
         return [*self.keyframes, self._latest]
 
-    def add(self, frame: StampedFrame, estimate, usable: np.ndarray) -> None:
-        """Take in one frame with the pose that LiDAR (and odometry) gave it.
-
-        Args:
-          estimate: slam.Estimate of the frame.
-          usable: (M,) which of its ranges may be used.
-        """
+    def add(self, frame: StampedFrame, estimate: Estimate) -> None:
+        """Take in one frame with the pose that LiDAR (and odometry) gave it."""
         pose = np.asarray(estimate.pose, float)
         measured = bool(frame.frame.odometry.valid)
         self._odometry = self._odometry and measured
@@ -149,7 +143,7 @@ class Buffer:
                 self._odometry = True
                 if len(self.keyframes) > _MOST_KEYFRAMES:
                     self._thin()
-        for k in np.flatnonzero(usable):
+        for k in np.flatnonzero(self.host.usable(frame.frame.ranges)):
             self._add_range(frame, int(k), pose, np.asarray(estimate.velocity, float), float(estimate.yaw_rate))
 
     def _far_from_last(self, key: Keyframe) -> bool:
@@ -159,11 +153,9 @@ class Buffer:
         return bool(np.hypot(*moved[:2]) > _MOVED[0] or abs(moved[2]) > _MOVED[1] or blind)
 
     def _add_range(self, frame: StampedFrame, k: int, pose: np.ndarray, velocity: np.ndarray, yaw_rate: float) -> None:
-        r: Ranges = frame.frame.ranges
+        r = frame.frame.ranges
         i, j = sorted((int(r.i[k]), int(r.j[k])))
-        rise = self.height[i] - self.height[j]
-        slant = (float(r.range[k]) - self.bias[i] - self.bias[j]) / (1.0 + self.bias_scale)
-        flat = float(np.sqrt(max(slant**2 - rise**2, 0.01)))
+        flat = float(self.host.flat(float(r.range[k]), i, j))
         if i > 0:
             self.pairs.setdefault((i, j), deque(maxlen=_MOST_OF_PAIR)).append(flat)
             return
@@ -201,7 +193,7 @@ class Buffer:
         after = np.minimum(at + 1, len(stamps) - 1)
         share = np.where(after > at, (stamp - stamps[at]) / np.maximum(stamps[after] - stamps[at], 1.0), 0.0)
         share = np.clip(share, 0.0, 1.0)
-        antenna = pose[:, :2] + turned(pose[:, 2], self.antenna)
+        antenna = pose[:, :2] + turned(pose[:, 2], self.host.antenna)
         local = [turned(-poses[k, 2], antenna - poses[k, :2]) for k in (at, after)]
         scatter = self._scatter(distance)
         # two means in each interval: one would leave the keyframes free to move to and fro between their middles
@@ -212,11 +204,11 @@ class Buffer:
             mine = np.flatnonzero(halves == k)
             middle = np.sort(distance[mine])[len(mine) // 2]  # one of them, so that at least one is near it
             ok = mine[np.abs(distance[mine] - middle) < _WILD_M]
-            sigma = mean_sigma(len(ok), float(np.median(scatter[mine])), self.sigma_n)
+            sigma = mean_sigma(len(ok), float(np.median(scatter[mine])), self.host.sigma_n)
             rows.append((share[ok].mean(), local[0][ok].mean(0), local[1][ok].mean(0), distance[ok].mean(), sigma))
         share, before, after, distance, sigma = (np.array(column) for column in zip(*rows, strict=True))
         # a wall makes all of its ranges too long: many of them tell no more than one
-        walled = sigma > mean_sigma(1, self.sigma_n, self.sigma_n)
+        walled = sigma > mean_sigma(1, self.host.sigma_n, self.host.sigma_n)
         sigma = np.where(walled, sigma * np.sqrt(max(np.sum(walled), 1)), sigma)
         return Averages(groups // 2, np.full(len(groups), slot), share, before, after, distance, sigma)
 
@@ -224,7 +216,7 @@ class Buffer:
         """(R,) standard deviation of a pair's ranges around each of them, from second differences: a model-free one,
         so that it can tell a range through walls from a place that is not yet right."""
         if len(distance) < _WINDOW:
-            return np.full(len(distance), self.sigma_n)
+            return np.full(len(distance), self.host.sigma_n)
         second = np.abs(distance[2:] - 2 * distance[1:-1] + distance[:-2])
         window = np.lib.stride_tricks.sliding_window_view(second, min(_WINDOW, len(second)))
         # the median of |x| of a normal x is 0.674 sigma, and a second difference has 6 sigma^2
@@ -241,7 +233,7 @@ class Buffer:
         for (i, j), kept in self.pairs.items():
             latest = np.array(kept)[-2 * _WINDOW :]
             found[i, j] = found[j, i] = np.median(np.abs(latest - np.median(latest))) / 0.674
-        return np.log(np.maximum(found / self.sigma_n, 1.0))
+        return np.log(np.maximum(found / self.host.sigma_n, 1.0))
 
     def pair_medians(self) -> dict[tuple[int, int], tuple[float, float]]:
         """(i, j) -> median range between two beacons and its standard deviation [m]."""
@@ -249,7 +241,7 @@ class Buffer:
         for pair, kept in self.pairs.items():
             values = np.array(kept)
             middle = float(np.median(values))
-            scatter = float(np.median(np.abs(values - middle))) / 0.674 if len(values) >= 5 else self.sigma_n
+            scatter = float(np.median(np.abs(values - middle))) / 0.674 if len(values) >= 5 else self.host.sigma_n
             # a median of n is as good as a mean of 0.64 n
-            found[pair] = middle, mean_sigma(0.64 * len(values), scatter, self.sigma_n)
+            found[pair] = middle, mean_sigma(0.64 * len(values), scatter, self.host.sigma_n)
         return found

@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import shortest_path
 
 from uwbslam_jax.measurements import StampedFrame
 from uwbslam_jax.numerics import RANGE_FLOOR_M
-from uwbslam_jax.settings import Params
+from uwbslam_jax.settings import HostParams
 
 _KEPT = 1024
 """So many of a link's newest ranges are kept."""
@@ -62,16 +62,14 @@ class Links:
         self.rise: dict[Pair, float] = {}
         self._ranges: dict[Pair, deque[tuple[float, bool]]] = {}
 
-    def hear(self, frame: StampedFrame, ids: dict[int, int], params: Params, nlos_gap_db: float) -> None:
+    def hear(self, frame: StampedFrame, ids: Mapping[int, int], host: HostParams) -> None:
         """All ranges of a frame, the configured biases taken off. ids: slot -> node id."""
         r = frame.frame.ranges
-        bias, height = np.asarray(params.bias, float), np.asarray(params.height, float)
-        scale = 1.0 + float(params.bias_scale)
+        in_sight = host.usable(r)
         for k in np.flatnonzero(r.valid):
             i, j = int(r.i[k]), int(r.j[k])
-            slant = (float(r.range[k]) - bias[i] - bias[j]) / scale
-            self.add(ids[i], ids[j], slant, in_sight=not float(r.power_gap[k]) > nlos_gap_db)
-            self.rise[min(ids[i], ids[j]), max(ids[i], ids[j])] = float(height[i] - height[j])
+            self.add(ids[i], ids[j], host.slant(float(r.range[k]), i, j), in_sight=bool(in_sight[k]))
+            self.rise[min(ids[i], ids[j]), max(ids[i], ids[j])] = float(host.rise(i, j))
 
     def add(self, a: int, b: int, distance: float, *, in_sight: bool = True) -> None:
         """One range [m] between two nodes, what is known of its bias taken off; in_sight: by the power rule."""

@@ -16,7 +16,7 @@ from uwbslam_jax.backend import Graph, Solution
 from uwbslam_jax.errors import RolloutError
 from uwbslam_jax.measurements import Message
 from uwbslam_jax.session import FrameAssembler, Session, fit_beams
-from uwbslam_jax.settings import Params, Settings
+from uwbslam_jax.settings import HostParams, Settings
 from uwbslam_jax.tuning import parameters
 from uwbslam_jax.tuning.mounting import FIXED, Mounting
 
@@ -67,23 +67,23 @@ def calibrate(messages: Sequence[Message], settings: Settings, names: Sequence[s
         if session.hindsight is None:
             raise RolloutError(f"start-up has decided nothing ({session.status}), or nothing ranged")
         solution = session.hindsight.solution
-        found, sigma, told = solve(session.graph, session.params, solution, session.slots, names, start)
+        found, sigma, told = solve(session.graph, session.host, solution, session.slots, names, start)
     return Calibration(tuple(names), start, found, sigma, told)
 
 
 def solve(
-    graph: Graph, params: Params, solution: Solution, slots: dict[int, int], names: Sequence[str], start: Array
+    graph: Graph, host: HostParams, solution: Solution, slots: dict[int, int], names: Sequence[str], start: Array
 ) -> tuple[Array, Array, tuple[str, ...]]:
     """Values, standard deviations and what is told of each parameter.
 
     Args:
-      params: what the graph was made with. solution: of the graph, to start from. slots: node id -> slot.
+      host: what the graph was made with. solution: of the graph, to start from. slots: node id -> slot.
       start: (p,) what the priors are about.
 
     Raises:
       RolloutError: a bias is asked of a node that is not heard, or there are too few ranges.
     """
-    mounting = Mounting.build(graph, params, solution)
+    mounting = Mounting.build(graph, host, solution)
     if mounting is None:
         raise RolloutError("too few ranges to beacons at rest")
     columns = []

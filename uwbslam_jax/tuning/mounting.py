@@ -9,7 +9,7 @@ import numpy as np
 
 from uwbslam_jax.backend import Graph, Problem, Solution
 from uwbslam_jax.numerics import Sink, between, compose, covariance, minimise, soften, turned, wrapped
-from uwbslam_jax.settings import Params
+from uwbslam_jax.settings import HostParams
 
 _SCALE = 0.1
 """Spread of the wheels' scale errors, of way and turn."""
@@ -39,25 +39,21 @@ class Mounting:
 
     problem: Problem
     graph: Graph
-    params: Params
-    lidar0: Array
-    antenna: Array
+    host: HostParams
     poses: Array
     start: Array
     wheels: tuple[float, float] = _WHEELS
     stage: tuple[float, float] = _STAGES[0]
 
     @staticmethod
-    def build(graph: Graph, p: Params, solution: Solution) -> Mounting | None:
+    def build(graph: Graph, host: HostParams, solution: Solution) -> Mounting | None:
         """The problem of a run, None where there are too few ranges to beacons at rest."""
-        bias, height = np.asarray(p.bias, float), np.asarray(p.height, float)
         places = dict(zip(solution.nodes, solution.beacons, strict=True))
-        problem = Problem.build(graph, solution.poses, places, height, bias, float(p.bias_scale))
+        problem = Problem.build(graph, solution.poses, places, host)
         if problem is None:
             return None
         x = np.append(problem.start(solution.poses, places), np.zeros(5))
-        antenna, lidar = np.asarray(p.antenna, float), np.asarray(p.lidar, float)
-        return Mounting(problem, graph, p, lidar, antenna, solution.poses, x)
+        return Mounting(problem, graph, host, solution.poses, x)
 
     @property
     def bias(self) -> int:
@@ -73,8 +69,8 @@ class Mounting:
         """What the run was made with, of the columns asked for."""
         slots = np.array(self.problem.slots)
         every = np.zeros(self.problem.size + 5)
-        every[self.bias : self.lidar] = np.asarray(self.params.bias, float)[slots]
-        every[self.lidar : self.lidar + 3] = self.lidar0
+        every[self.bias : self.lidar] = self.host.bias[slots]
+        every[self.lidar : self.lidar + 3] = self.host.lidar
         return every[at]
 
     def minimise(self, at: Array, prior: Array, offset: Array) -> tuple[Array, Array]:
@@ -117,7 +113,7 @@ class Mounting:
         keep = p.soft | ~self._rolled()[p.new]
         old, new, measured, roots, soft = (a[keep] for a in (p.old, p.new, p.between, p.roots, p.soft))
         columns = [*_columns(3 * old, 3), *_columns(3 * new, 3), *_shared(self.lidar, 3, len(old))]
-        own, back = self.lidar0[None], _inverse(self.lidar0[None])
+        own, back = self.host.lidar[None], _inverse(self.host.lidar[None])
         motion = compose(compose(back, measured), own)
 
         def on_robot(m: Array) -> Array:
@@ -127,7 +123,7 @@ class Mounting:
         roots = roots @ np.stack(slopes, axis=-1)
 
         def residual(v: Array) -> Array:
-            lidar = self.lidar0 + v[:, 6:]
+            lidar = self.host.lidar + v[:, 6:]
             e = between(compose(v[:, :3], lidar), compose(v[:, 3:6], lidar)) - motion
             e[:, 2] = wrapped(e[:, 2])
             white = np.einsum("eij,ej->ei", roots, e)
@@ -182,10 +178,10 @@ class Mounting:
         turn = wrapped(self.poses[p.at + 1, 2] - self.poses[p.at, 2])
 
         def residual(v: Array) -> Array:
-            change = compose(self.lidar0 + v[:, 10:], _inverse(np.broadcast_to(self.lidar0, (len(v), 3))))
+            change = compose(self.host.lidar + v[:, 10:], _inverse(np.broadcast_to(self.host.lidar, (len(v), 3))))
             # robot frames of the run, as seen from those with this mounting
             back = _inverse(change)
-            shift = compose(back, np.append(self.antenna, 0.0))[:, :2] - self.antenna
+            shift = compose(back, np.append(self.host.antenna, 0.0))[:, :2] - self.host.antenna
             ends = []
             for pose, lever, angle in (
                 (v[:, :3], p.before, p.share * turn),
