@@ -1,4 +1,4 @@
-"""What recordings tell of the parameters: geometry from the whole runs, then noises along rollouts; and that as a table."""
+"""What recordings tell of the parameters: geometry from whole runs, then noises along rollouts; and that as a table."""
 
 from __future__ import annotations
 
