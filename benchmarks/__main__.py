@@ -12,7 +12,6 @@ import importlib
 import sys
 
 from benchmarks.metric import judge, publish
-from uwbslam_jax.process import prepare
 
 NAMES = {
     "step": "one online step beside KISS-ICP on the same scans",
@@ -33,7 +32,6 @@ _THEORY = ("bound", "tuning", "gamma", "paper")
 
 def main() -> int:
     """Returns 0, or 1 where the gate is shut."""
-    prepare()  # before JAX is imported, which reads it once
     told = "\n".join(f"  {name:<8} {about}" for name, about in NAMES.items())
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks", description=f"{__doc__}\n{told}", formatter_class=argparse.RawTextHelpFormatter

@@ -11,7 +11,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 
-from uwbslam_jax.files.run_folder import read_run
+from uwbslam_jax.files import read_run
 
 
 def read_map(directory: Path) -> tuple[np.ndarray, tuple[float, float, float, float]]:

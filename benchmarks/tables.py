@@ -7,6 +7,7 @@ import math
 import os
 import platform
 import subprocess
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -23,6 +24,25 @@ def line(cells: list[str]) -> str:
 def cell(value: float | None, digits: int) -> str:
     """A number, a dash where there is none."""
     return f"{value:.{digits}f}" if value is not None and math.isfinite(value) else "-"
+
+
+def figures_table(
+    words: Sequence[str],
+    columns: Mapping[str, tuple[str, int]],
+    rows: Iterable[tuple[Sequence[str], Mapping[str, Any]]],
+) -> list[str]:
+    """Rows of words, then figures; a dash where a row has none.
+
+    Args:
+      words: heads of the columns of words. columns: key of a figure -> head of its column, and its digits.
+      rows: the words of each, and its figures by their keys.
+    """
+    lines = [line([*words, *(head for head, _ in columns.values())])]
+    lines += [line([*["---"] * len(words), *["---:"] * len(columns)])]
+    return lines + [
+        line([*told, *(cell(figures.get(key), digits) for key, (_, digits) in columns.items())])
+        for told, figures in rows
+    ]
 
 
 def plain(values: Any) -> Any:

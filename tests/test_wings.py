@@ -22,7 +22,7 @@ WINGS = [
     "session",
     "tuning",
     "sim files",
-    "web plotting",
+    "web plotting simulation",
     "api",
     "live",
     "cli",

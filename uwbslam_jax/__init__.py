@@ -22,14 +22,12 @@ if TYPE_CHECKING:
     from uwbslam_jax import estimator as estimator
     from uwbslam_jax.api import (
         Result as Result,
-        Simulation as Simulation,
         Slam as Slam,
         evaluate as evaluate,
         inspect as inspect,
         read as read,
         rollout as rollout,
         run as run,
-        simulate as simulate,
         tune as tune,
     )
     from uwbslam_jax.errors import UwbslamError as UwbslamError
@@ -53,9 +51,11 @@ if TYPE_CHECKING:
         UwbSettings as UwbSettings,
     )
     from uwbslam_jax.sim import SCENARIOS as SCENARIOS
+    from uwbslam_jax.simulation import Simulation as Simulation, simulate as simulate
+    from uwbslam_jax.tuning import Rollout as Rollout, Tuned as Tuned
 
 _HOME = {
-    "api": "Result Simulation Slam evaluate inspect read rollout run simulate tune",
+    "api": "Result Slam evaluate inspect read rollout run tune",
     "errors": "UwbslamError",
     "evaluation": "Truth",
     "files": "load_settings save_settings",
@@ -64,6 +64,8 @@ _HOME = {
     "session": "Update",
     "settings": "FilterSettings LidarSettings MapSettings OdomSettings RobotSettings Settings UwbSettings",
     "sim": "SCENARIOS",
+    "simulation": "Simulation simulate",
+    "tuning": "Rollout Tuned",
 }
 """Module or wing -> the names that it gives to the front door; a test holds it to the imports above."""
 _PLACE = {name: f"uwbslam_jax.{module}" for module, names in _HOME.items() for name in names.split()}

@@ -10,9 +10,8 @@ import dataclasses
 import itertools
 import time
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, TypeGuard, cast
 
@@ -20,12 +19,12 @@ from uwbslam_jax import evaluation, result as data
 from uwbslam_jax.errors import LogError, UsageError
 from uwbslam_jax.estimator import CompileClock
 from uwbslam_jax.evaluation import Truth
-from uwbslam_jax.files import LogReader, LogSummary, LogWriter, inspect_log, read_run, settings_file, write_result
+from uwbslam_jax.files import LogReader, LogSummary, inspect_log, read_run, settings_file, write_result
 from uwbslam_jax.measurements import Message, ScanMessage, TruthMessage
 from uwbslam_jax.result import MapImage, RunStatus
 from uwbslam_jax.session import PEEK_SCANS, Facts, Runner, Saved, Update, fit_beams, saved_state
 from uwbslam_jax.settings import Settings
-from uwbslam_jax.sim import SCENARIOS, Scenario, make_scenario, settings_overrides, simulate as messages_of
+from uwbslam_jax.simulation import Simulation
 from uwbslam_jax.tuning import Log, Rollout, Tuned, prepare, tune as tune_logs
 from uwbslam_jax.web import write_report
 
@@ -96,65 +95,7 @@ class Result(data.Result):
         return axes
 
 
-@dataclass(frozen=True)
-class Simulation:
-    """A simulated recording: iterates over its messages, the same each time, one at a time.
-
-    Attributes:
-      scenario: what is simulated.
-    """
-
-    scenario: Scenario
-
-    def __iter__(self) -> Iterator[Message]:
-        return messages_of(self.scenario)
-
-    @cached_property
-    def settings(self) -> Settings:
-        """What a user would configure for this robot: lever arms and heights, never what is to be found out."""
-        return settings_file.from_dict(settings_overrides(self.scenario))
-
-    @cached_property
-    def truth(self) -> Truth:
-        """Where robot and beacons were."""
-        return Truth.from_messages(m for m in self if isinstance(m, TruthMessage))
-
-    def save(self, path: str | Path, progress: Callable[[int], object] | None = None) -> None:
-        """Writes the recording as MCAP. progress: called with the number of scans so far. Raises LogError."""
-        scans = 0
-        with LogWriter(path) as writer:
-            for message in self:
-                writer.write(message)
-                scans += isinstance(message, ScanMessage)
-                if progress is not None:
-                    progress(scans)
-
-
 Source = Paths | LogReader | Simulation | Iterable[Message]
-
-
-def simulate(name: str, seed: int = 0, duration: float | None = None, *, beams: int | None = None) -> Simulation:
-    """A ready-made scenario, see `SCENARIOS`.
-
-    Args:
-      seed: another seed is another world. duration: [s], the scenario's own where not given.
-      beams: of a scan, in place of the scenario's.
-
-    Raises:
-      UsageError: there is no such scenario, or a number is out of range.
-    """
-    if name not in SCENARIOS:
-        raise UsageError(f"no scenario {name}; there are {', '.join(SCENARIOS)}")
-    if seed < 0:
-        raise UsageError(f"seed {seed}: must not be negative")
-    if duration is not None and not 0.0 < duration < 1e6:
-        raise UsageError(f"duration {duration:g} s: must be greater than 0")
-    if beams is not None and beams < 2:
-        raise UsageError(f"beams {beams}: must be 2 at least")
-    made = make_scenario(name, seed, duration)
-    if beams is not None:
-        made = dataclasses.replace(made, lidar=dataclasses.replace(made.lidar, beams=beams))
-    return Simulation(made)
 
 
 def read(path: Paths, settings: Settings | None = None) -> LogReader:
@@ -233,7 +174,8 @@ def run(
 
 
 class Slam:
-    """A run fed message by message, as on a robot. The same messages give the bits of `run`.
+    """A run fed message by message, as on a robot. The same messages give the bits of `run`, where both make room for
+    the same number of beams: see `fit`.
 
     Attributes:
       settings: what it runs with.
@@ -256,7 +198,7 @@ class Slam:
           on_update: called with each update before the host looks at what it means for beacons and map, which takes
             longer now and then.
           fit: make room for as many beams as the first scans have, by holding the first second of messages. Without,
-            for lidar.max_beams at once.
+            or where no scan comes in that time, for lidar.max_beams.
 
         Raises:
           ConfigError, RunError, UsageError: see `run`.
@@ -288,7 +230,8 @@ class Slam:
 
     def _release(self) -> list[Update]:
         """What was held goes in."""
-        self.settings = fit_beams(self.settings, self._held)
+        if any(isinstance(m, ScanMessage) for m in self._held):  # a LiDAR that is late may have any number of beams
+            self.settings = fit_beams(self.settings, self._held)
         self._runner, held, self._held = self._start(), self._held, []
         return list(itertools.chain.from_iterable(map(self.add, held)))
 
@@ -306,7 +249,7 @@ class Slam:
         return self.runner.session.status if self._runner is not None else RunStatus.WAITING
 
     def map(self) -> MapImage:
-        """The map so far."""
+        """The map so far; messages that are still held go in first."""
         return self.runner.session.map()
 
     def finish(self, facts: Facts | None = None) -> Result:
@@ -321,7 +264,7 @@ class Slam:
     def save(self, folder: str | Path) -> bool:
         """Writes the state, for `resume` and `localize`, into a folder, which is created; False where there is none to
         save, because the frame is not decided or the run only localises. Raises OSError."""
-        saved = self.runner.saved()
+        saved = None if self._runner is None else self._runner.saved()
         if saved is not None:
             Path(folder).mkdir(parents=True, exist_ok=True)
             saved_state.save(saved, Path(folder))

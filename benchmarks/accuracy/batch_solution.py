@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from uwbslam_jax.evaluation import Truth, evaluate, rigid_fit
-from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage
+from uwbslam_jax import OdometryMessage, RangeMessage, Truth
+from uwbslam_jax.evaluation import evaluate, rigid_fit
+from uwbslam_jax.measurements import Message
 
 _KNOT_S = 1.0
 _MOST_KNOTS = 240

@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
+import uwbslam_jax as us
+from benchmarks.accuracy import trials
 from benchmarks.tables import cell, line, provenance, write
-from uwbslam_jax.process import prepare
 
 BOUNDS = (0.3, 2.0)
 """Between these the mean NEES over its degrees of freedom has to lie."""
@@ -28,10 +29,7 @@ _FIGURES = {"pose_nees_ratio": "pose", "beacon_nees_ratio": "beacons"}
 
 def measure(name: str, seed: int, duration: float | None) -> dict[str, Any]:
     """NEES over dof of one run, with its errors."""
-    from benchmarks.accuracy import trials
-    from uwbslam_jax.sim import make_scenario
-
-    figures = trials.measure(make_scenario(name, seed, duration)).figures
+    figures = trials.measure(us.simulate(name, seed, duration).scenario).figures
     return {"seed": seed, **{key: figures[key] for key in (*_FIGURES, "robot_rmse_m", "beacon_mean_m")}}
 
 
@@ -68,7 +66,6 @@ def table(found: dict[str, list[dict[str, Any]]], facts: dict[str, str]) -> str:
 
 def main() -> int:
     """Returns 0, or 1 where a mean is out of bounds."""
-    prepare()  # before JAX is imported, which reads it once
     parser = argparse.ArgumentParser(prog="python -m benchmarks.accuracy.consistency", description=__doc__)
     parser.add_argument("--runs", type=int, default=math.inf, help="at most so many a scenario: nothing is written")
     options = parser.parse_args()

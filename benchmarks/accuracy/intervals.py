@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.accuracy.checks import Stay
-from uwbslam_jax.sim import Interval, Scenario
-from uwbslam_jax.sim.paths import Carried, Turn
+from uwbslam_jax.sim import Interval, Scenario, paths
 
 _TURNED = np.deg2rad(1.0)
 _BACK_S = 2.0
@@ -15,7 +14,7 @@ _BACK_S = 2.0
 
 def carried(scenario: Scenario) -> list[Interval]:
     """When the robot itself is carried."""
-    return scenario.path.spans(Carried)
+    return scenario.path.spans(paths.Carried)
 
 
 def disturbed(scenario: Scenario) -> list[Interval]:
@@ -33,7 +32,7 @@ def first_turn(scenario: Scenario) -> float:
 
 def stops(scenario: Scenario) -> list[float]:
     """The start, and the middle of each turn on the spot until the end."""
-    middles = [0.5 * (begin + end) for begin, end in scenario.path.spans(Turn)]
+    middles = [0.5 * (begin + end) for begin, end in scenario.path.spans(paths.Turn)]
     return [0.0, *(t for t in middles if t < scenario.duration)]
 
 

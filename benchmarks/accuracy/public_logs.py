@@ -12,8 +12,16 @@ from pathlib import Path
 
 import numpy as np
 
-from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, TruthMessage
-from uwbslam_jax.settings import MapSettings, RobotSettings, Settings, UwbSettings
+from uwbslam_jax import (
+    MapSettings,
+    OdometryMessage,
+    RangeMessage,
+    RobotSettings,
+    Settings,
+    TruthMessage,
+    UwbSettings,
+)
+from uwbslam_jax.measurements import Message
 
 LIGHT = 299.792458
 """Speed of light [m/us]."""

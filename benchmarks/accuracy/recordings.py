@@ -1,17 +1,19 @@
 """How far off the answer is on recordings with known truth, with the defaults, with and without their odometry.
 
-`python -m benchmarks.accuracy.recordings FOLDER` runs every NAME.mcap below FOLDER that has a NAME.truth.npz beside it, and the
-public logs without LiDAR that lie in FOLDER, and writes results/recordings.md and .json.
+`python -m benchmarks.accuracy.recordings FOLDER` runs every NAME.mcap below FOLDER that has a NAME.truth.npz beside it,
+and the public logs without LiDAR that lie in FOLDER, and writes results/recordings.md and .json.
 """
 
 from __future__ import annotations
 
 import argparse
-import dataclasses
 from pathlib import Path
+from typing import Any
 
-from benchmarks.tables import cell, line, provenance, write
-from uwbslam_jax.process import prepare
+import uwbslam_jax as us
+from benchmarks.accuracy import without_lidar
+from benchmarks.accuracy.sharpness import scan_misfit
+from benchmarks.tables import figures_table, provenance, write
 
 _COLUMNS = {
     "robot_rmse_m": ("robot RMS [m]", 3),
@@ -30,37 +32,24 @@ _COLUMNS = {
 
 def measure(log: Path, *, odometry: bool) -> dict[str, float | None]:
     """Figures of one run of a recording."""
-    from benchmarks.accuracy.sharpness import scan_misfit
-    from uwbslam_jax.api import run_log
-    from uwbslam_jax.evaluation import Truth, consistency, evaluate
-    from uwbslam_jax.files.mcap_log import LogReader
-    from uwbslam_jax.measurements import ScanMessage
-    from uwbslam_jax.settings import OdomSettings, Settings
-
-    settings = dataclasses.replace(Settings(), odom=OdomSettings(use=odometry))
-    result, _ = run_log(log, settings)
-    beacons = {beacon.id: beacon.position for beacon in result.beacons}
-    truth = Truth.load(log.with_suffix(".truth.npz"))
-    figures = evaluate(result.stamps, result.poses, beacons, truth) | consistency(result, truth)
-    figures["online_ate_m"] = evaluate(result.stamps, result.online, {}, truth)["robot_ate_m"]
-    lidar = settings.lidar
-    reader = LogReader(log, scan_topic=lidar.topic, uwb_topic=None, odom_topic=None)
-    scans = (message for message in reader if isinstance(message, ScanMessage))
-    limits = (lidar.min_range, lidar.max_range)
+    settings = us.Settings(odom=us.OdomSettings(use=odometry))
+    result = us.run(log, settings)
+    result.truth = us.Truth.load(log.with_suffix(".truth.npz"))
+    scans = (message for message in us.read(log, settings) if isinstance(message, us.ScanMessage))
+    limits = (settings.lidar.min_range, settings.lidar.max_range)
     misfit = scan_misfit(result.map, result.stamps, result.poses, scans, settings.robot.lidar, limits)
-    found = {**figures, "scan_misfit": misfit, **result.summary}
+    found = {**result.errors(), "scan_misfit": misfit, **result.summary}
     return {key: found[key] for key in _COLUMNS}
 
 
 def main() -> None:
     """The command line."""
-    prepare()  # before JAX is imported, which reads it once
     parser = argparse.ArgumentParser(prog="python -m benchmarks.accuracy.recordings", description=__doc__)
     parser.add_argument("folder", type=Path)
     folder = parser.parse_args().folder
     logs = [log for log in sorted(folder.rglob("*.mcap")) if log.with_suffix(".truth.npz").exists()]
     facts = provenance(workers=1)
-    rows = [
+    rows: list[dict[str, Any]] = [
         {"recording": log.stem, "odometry": odometry, **measure(log, odometry=odometry)}
         for log in logs
         for odometry in (True, False)
@@ -79,13 +68,8 @@ def main() -> None:
     ]
     if not logs:
         lines += ["No recording with LiDAR and truth in the folder: skipped.", ""]
-    lines += [line(["recording", "odometry", *(label for label, _ in _COLUMNS.values())])]
-    lines += [line(["---", "---", *["---:"] * len(_COLUMNS)])]
-    for row in rows:
-        cells = [cell(row[key], digits) for key, (_, digits) in _COLUMNS.items()]
-        lines.append(line([str(row["recording"]), "used" if row["odometry"] else "left out", *cells]))
-    from benchmarks.accuracy import without_lidar
-
+    told = ((row["recording"], "used" if row["odometry"] else "left out") for row in rows)
+    lines += figures_table(("recording", "odometry"), _COLUMNS, zip(told, rows, strict=True))
     driven, rest = list(without_lidar.driven_rows(folder)), list(without_lidar.rest_rows(folder))
     lines += without_lidar.tables(driven, rest)
     data = {"provenance": facts, "rows": rows, "without_lidar": driven, "at_rest": rest}

@@ -1,7 +1,7 @@
 """How far off the answer is in the simulated scenarios, against the bar of each, with the defaults.
 
-`python -m benchmarks.accuracy.scenarios` runs every row with 5 seeds and writes results/scenarios.md and .json; names pick rows
-and write nothing. Each seed has its own world, beacons and orientation. Exit status 1 if a bar is missed.
+`python -m benchmarks.accuracy.scenarios` runs every row with 5 seeds and writes results/scenarios.md and .json; names
+pick rows and write nothing. Each seed has its own world, beacons and orientation. Exit status 1 if a bar is missed.
 """
 
 from __future__ import annotations
@@ -15,10 +15,11 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from typing import Any
 
+import uwbslam_jax as us
 from benchmarks.accuracy.sharpness import STRAY_M
 from benchmarks.accuracy.suite import ROWS, STRAY, Row
-from benchmarks.tables import cell, line, plain, provenance, write
-from uwbslam_jax.process import prepare
+from benchmarks.accuracy.trials import measure
+from benchmarks.tables import cell, figures_table, line, plain, provenance, write
 
 Seed = dict[str, Any]
 """One seed's figures: those of `trials.measure`, `seed`, `load`, `checks` (name -> figure) and `failed` (in words)."""
@@ -46,11 +47,7 @@ _HIGHER_IS_BETTER = {"sharpness", "own_sharpness", "real_time_factor"}
 
 def judge(name: str, seed: int, duration: float | None) -> Seed:
     """Simulates one seed, runs it and judges it."""
-    # here, not above: a worker process sets up JAX on its own
-    from benchmarks.accuracy.trials import measure
-    from uwbslam_jax.sim import make_scenario
-
-    made = make_scenario(name, seed, duration)
+    made = us.simulate(name, seed, duration).scenario
     outcome = measure(made)
     found = outcome.found(ROWS[name].checks, made)
     failed = ROWS[name].shortfalls(outcome.figures, found)
@@ -129,20 +126,17 @@ def verdict(seeds: list[Seed]) -> str:
 
 def seed_table(rows: dict[str, list[Seed]]) -> str:
     """Every seed's figures in Markdown."""
-    columns = {**_COLUMNS, **_MORE}
-    lines = ["", "<details><summary>Every seed</summary>", ""]
-    lines += [line(["scenario", "seed", *(label for label, _ in columns.values()), "fails at"])]
-    lines += [line(["---", "---:", *["---:"] * len(columns), "---"])]
-    for name, seeds in rows.items():
-        for seed in seeds:
-            figures = [cell(seed[key], digits) for key, (_, digits) in columns.items()]
-            lines.append(line([f"`{name}`", str(seed["seed"]), *figures, "; ".join(seed["failed"])]))
-    return "\n".join([*lines, "", "</details>"]) + "\n"
+    every = [
+        ((f"`{name}`", str(seed["seed"]), "; ".join(seed["failed"]) or "-"), seed)
+        for name, seeds in rows.items()
+        for seed in seeds
+    ]
+    lines = figures_table(("scenario", "seed", "fails at"), {**_COLUMNS, **_MORE}, every)
+    return "\n".join(["", "<details><summary>Every seed</summary>", "", *lines, "", "</details>"]) + "\n"
 
 
 def main() -> int:
     """Returns 0, or 1 where a bar is missed."""
-    prepare()  # before JAX is imported, which reads it once
     parser = argparse.ArgumentParser(prog="python -m benchmarks.accuracy.scenarios", description=__doc__)
     parser.add_argument("names", nargs="*", choices=[*ROWS, []], metavar="NAME", help=f"of {', '.join(ROWS)}")
     parser.add_argument("--seeds", type=int, default=5, help="run seeds 0 to this less one")

@@ -6,9 +6,9 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from uwbslam_jax import MapImage, ScanMessage
 from uwbslam_jax.evaluation import RigidMotion, rigid_fit
-from uwbslam_jax.measurements import ScanMessage
-from uwbslam_jax.result import OCCUPIED_THRESHOLD, MapImage
+from uwbslam_jax.result import OCCUPIED_THRESHOLD
 
 _FITTED = 2000
 """Cells that take part in a map's own fit, evenly."""

@@ -4,27 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+import uwbslam_jax as us
 from benchmarks.accuracy.checks import NAN, Trial, rms_outside
 from benchmarks.accuracy.intervals import disturbed
 from benchmarks.accuracy.sharpness import occupied, own_fit, sharpness, stray, wall_distances
 from benchmarks.accuracy.suite import Check
-from uwbslam_jax.api import run_messages
-from uwbslam_jax.evaluation import RigidMotion, Truth, align, consistency, evaluate
-from uwbslam_jax.files.settings_file import from_dict
-from uwbslam_jax.measurements import Message
+from uwbslam_jax.evaluation import RigidMotion, align, consistency, evaluate
 from uwbslam_jax.numerics import wrapped
-from uwbslam_jax.result import MapImage, Result
-from uwbslam_jax.settings import Settings
-from uwbslam_jax.sim import START_NS, Scenario, settings_overrides, simulate
-
-_MEMORY_SAMPLES = 100
+from uwbslam_jax.sim import START_NS, Scenario
 
 
 @dataclass(frozen=True)
@@ -39,8 +33,8 @@ class Outcome:
       figures: name -> number, see `measure`.
     """
 
-    result: Result
-    truth: Truth
+    result: us.Result
+    truth: us.Truth
     motion: RigidMotion
     trial: Trial
     whole: Trial
@@ -51,29 +45,13 @@ class Outcome:
         return {c.name: c.measure(self.trial if c.online else self.whole, scenario) for c in checks}
 
 
-class _Watched:
-    """Messages of a run, and how much memory the process uses as they are read, for the last time that they are."""
-
-    def __init__(self, messages: Sequence[Message]):
-        self._messages = messages
-        self.memory: list[float] = []
-
-    def __iter__(self) -> Iterator[Message]:
-        self.memory = []
-        every = max(len(self._messages) // _MEMORY_SAMPLES, 1)
-        for count, message in enumerate(self._messages):
-            if count % every == 0:
-                self.memory.append(resident_mb())
-            yield message
-
-
 def resident_mb() -> float:
     """Memory that this process holds now [MB], NaN where the system does not tell as Linux does."""
     told = Path("/proc/self/statm")
     return int(told.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20 if told.exists() else NAN
 
 
-def measure(scenario: Scenario, settings: Settings | None = None) -> Outcome:
+def measure(scenario: Scenario, settings: us.Settings | None = None) -> Outcome:
     """Simulates, runs with the defaults, or with settings of another kind, and compares.
 
     The figures are robot_rmse_m (where the robot is not disturbed), online_rmse_m (the same of what was published on
@@ -81,15 +59,19 @@ def measure(scenario: Scenario, settings: Settings | None = None) -> Outcome:
     beacon_max_m, beacons_missing, covered, decided_s, sharpness, own_sharpness, stray, real_time_factor, peak_rss_mb,
     pose_nees_ratio and beacon_nees_ratio; NaN where there is nothing to compare.
     """
-    messages = _Watched(list(simulate(scenario)))
-    result, truth = run_messages(messages, settings or from_dict(settings_overrides(scenario)))
+    simulation = us.Simulation(scenario)
+    memory: list[float] = []
+    messages = list(simulation)  # so that the run's time is without the simulation's
+    result = us.run(messages, settings or simulation.settings, progress=lambda *_: memory.append(resident_mb()))
+    truth = result.truth
     assert truth is not None
     apart = disturbed(scenario)
     beacons = {beacon.id: beacon.position for beacon in result.beacons}
     motion = align(*_undisturbed(result, apart), beacons, truth)
     stamps, _ = _undisturbed(result, apart)
     calm = np.isin(result.stamps, stamps)
-    trial = lay_over(result, truth, align(stamps, result.online[calm], {}, truth), messages.memory)
+    # the last of the memory is told after the end
+    trial = lay_over(result, truth, align(stamps, result.online[calm], {}, truth), memory[:-1])
     whole = dataclasses.replace(lay_over(result, truth, motion), poses=motion.poses(result.poses))
     of_all = evaluate(result.stamps, result.poses, beacons, truth)
     true = truth.beacon_positions()
@@ -111,7 +93,7 @@ def measure(scenario: Scenario, settings: Settings | None = None) -> Outcome:
     return Outcome(result, truth, motion, trial, whole, figures)
 
 
-def _of_the_map(image: MapImage, motion: RigidMotion, walls: np.ndarray) -> dict[str, float]:
+def _of_the_map(image: us.MapImage, motion: RigidMotion, walls: np.ndarray) -> dict[str, float]:
     """sharpness where the run's fit puts the map; own_sharpness and stray where the map itself fits best."""
     cells = occupied(image, motion)
     distances = wall_distances(cells, walls)
@@ -120,7 +102,7 @@ def _of_the_map(image: MapImage, motion: RigidMotion, walls: np.ndarray) -> dict
     return {"sharpness": sharpness(distances, size), "own_sharpness": sharpness(own, size), "stray": stray(own)}
 
 
-def _undisturbed(result: Result, apart: Iterable[tuple[float, float]]) -> tuple[np.ndarray, np.ndarray]:
+def _undisturbed(result: us.Result, apart: Iterable[tuple[float, float]]) -> tuple[np.ndarray, np.ndarray]:
     """Stamps and poses that the fit may use."""
     t = (result.stamps - START_NS) / 1e9
     use = np.ones(t.shape, bool)
@@ -129,7 +111,7 @@ def _undisturbed(result: Result, apart: Iterable[tuple[float, float]]) -> tuple[
     return result.stamps[use], result.poses[use]
 
 
-def lay_over(result: Result, truth: Truth, motion: RigidMotion, memory: Sequence[float] = ()) -> Trial:
+def lay_over(result: us.Result, truth: us.Truth, motion: RigidMotion, memory: Sequence[float] = ()) -> Trial:
     """What a run published on its way, moved into the frame of the truth, in seconds since the simulation's start."""
     began = (result.stamps[0] - START_NS) / 1e9
     decided = result.summary["decided_at"]

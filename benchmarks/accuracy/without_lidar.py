@@ -12,11 +12,10 @@ from typing import Any
 
 import numpy as np
 
+import uwbslam_jax as us
 from benchmarks.accuracy import batch_solution
 from benchmarks.accuracy.public_logs import DRIVEN, P2P_BAR_M, PublicLog, p2p
-from benchmarks.tables import cell, line
-from uwbslam_jax.api import run_messages
-from uwbslam_jax.evaluation import evaluate
+from benchmarks.tables import figures_table
 
 _RANGE_SIGMA = {"plaza2": 0.6, "labyrinth": 0.1}
 """What the batch solution takes for the ranges' noise [m]."""
@@ -62,14 +61,14 @@ def _driven(log: PublicLog) -> Iterator[dict[str, Any]]:
     reference: dict[str, float] = {}
     for keys in _CONFIGURED[log.name]:
         settings = replace(log.settings, uwb=replace(log.settings.uwb, **keys))
-        result, truth = run_messages(log.messages, settings)
+        result = us.run(log.messages, settings)
+        truth = result.truth
         assert truth is not None
         if not reference:
             solved = batch_solution.solve(log.messages, truth, log.settings.robot.id, _RANGE_SIGMA[log.name])
             keys_of_it = ("robot_rmse_m", "robot_ate_m", "beacon_mean_m", "bias_scale")
             reference = {f"batch_{key}": solved[key] for key in keys_of_it}
-        beacons = {beacon.id: beacon.position for beacon in result.beacons}
-        found = {**evaluate(result.stamps, result.poses, beacons, truth), **result.summary, **reference}
+        found = {**us.evaluate(result, truth), **result.summary, **reference}
         configured = ", ".join(f"{key} = {value}" for key, value in keys.items()) or "-"
         yield {"recording": log.name, "configured": configured, **{key: found[key] for key in _DRIVEN}}
 
@@ -82,7 +81,7 @@ def rest_rows(folder: Path) -> Iterator[dict[str, Any]]:
         except FileNotFoundError:
             yield {"recording": "p2p", "skipped": "it is not in the folder"}
             return
-        result, _ = run_messages(log.messages, log.settings)
+        result = us.run(log.messages, log.settings)
         placed = {beacon.id: beacon.position for beacon in result.beacons}
         told = result.summary["relative"]
         counts = {"links_rejected": len(told["links_rejected"])}
@@ -116,12 +115,7 @@ def tables(driven: list[dict[str, Any]], rest: list[dict[str, Any]]) -> list[str
     ]
 
 
-def _table(rows: list[dict[str, Any]], columns: dict[str, tuple[str, int]]) -> Iterator[str]:
-    yield line(["recording", "configured", *(label for label, _ in columns.values())])
-    yield line(["---", "---", *["---:"] * len(columns)])
-    for row in rows:
-        if "skipped" in row:
-            yield line([row["recording"], f"skipped: {row['skipped']}", *["-"] * len(columns)])
-        else:
-            cells = [cell(row[key], digits) for key, (_, digits) in columns.items()]
-            yield line([row["recording"], row["configured"], *cells])
+def _table(rows: list[dict[str, Any]], columns: dict[str, tuple[str, int]]) -> list[str]:
+    told = [row["configured"] if "configured" in row else f"skipped: {row['skipped']}" for row in rows]
+    words = ((row["recording"], text) for row, text in zip(rows, told, strict=True))
+    return figures_table(("recording", "configured"), columns, zip(words, rows, strict=True))

@@ -19,12 +19,10 @@ from typing import Any
 import jax
 import numpy as np
 
+import uwbslam_jax as us
 from benchmarks.metric import Metric, Report, ratio
 from benchmarks.speed.scaling import Case, sized
-from uwbslam_jax.files.mcap_log import LogReader
-from uwbslam_jax.session.frame_assembler import FrameAssembler
-from uwbslam_jax.session.session import Session
-from uwbslam_jax.settings import MapSettings, Settings, UwbSettings
+from uwbslam_jax.session import FrameAssembler
 
 _SETS = (1, 4, 16, 64)
 _STEPS = 20
@@ -70,10 +68,10 @@ def _run(folder: Path, seconds: float) -> dict[str, float]:
 
 def _recording(folder: Path, seconds: float) -> list[Metric]:
     found = _run(folder, seconds)
-    settings = Settings()
-    assembler = FrameAssembler(settings, Session(settings).config.max_ranges)
+    settings = us.Settings()
+    assembler = FrameAssembler(settings, us.estimator.make_config(settings).max_ranges)
     begin = time.perf_counter()
-    frames = sum(len(assembler.add(message)) for message in LogReader(folder / f"{seconds:.0f}.mcap"))
+    frames = sum(len(assembler.add(message)) for message in us.read(folder / f"{seconds:.0f}.mcap"))
     reading = time.perf_counter() - begin
     stepping, rest = found["run_s"] - reading, found["wall_s"] - found["run_s"]
     factor = {"end to end": found["wall_s"], "reading": reading, "stepping": stepping, "start and writing": rest}
@@ -117,5 +115,5 @@ def _step_sets(sets: int) -> None:
 
 @cache
 def _stepped_sets(sets: int) -> Callable[[], Any]:
-    case = Case(5, sized(Settings(uwb=UwbSettings(max_beacons=5), map=MapSettings(size_m=25.6))))
+    case = Case(5, sized(us.Settings(map=us.MapSettings(size_m=25.6))))
     return case.many(sets, [case.frame() for _ in range(_STEPS)])

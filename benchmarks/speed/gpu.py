@@ -7,9 +7,9 @@ import time
 import jax
 import numpy as np
 
+import uwbslam_jax as us
 from benchmarks.metric import Metric, Report, ratio
 from benchmarks.speed.scaling import Case, sized
-from uwbslam_jax.settings import MapSettings, Settings, UwbSettings
 
 _RUNS = (1, 64, 1024, 4096)
 _STEPS = 10
@@ -24,7 +24,7 @@ def measure(*, quick: bool) -> Report:
     )
     if jax.default_backend() == "cpu":
         return Report(_TITLE, about, [], skipped="JAX sees no graphics card here, only the CPU")
-    case = Case(5, sized(Settings(uwb=UwbSettings(max_beacons=5), map=MapSettings(size_m=25.6))))
+    case = Case(5, sized(us.Settings(map=us.MapSettings(size_m=25.6))))
     frames = [case.frame() for _ in range(_STEPS)]
     times: dict[int, float] = {}
     for runs in _RUNS[:2] if quick else _RUNS:

@@ -18,12 +18,10 @@ from typing import Any
 import numpy as np
 from mcap.reader import make_reader
 
+import uwbslam_jax as us
 from benchmarks.metric import Metric, Report
-from uwbslam_jax.evaluation import Truth, evaluate
-from uwbslam_jax.files.mcap_log import LogReader
-from uwbslam_jax.files.run_folder import read_run, read_trajectory
-from uwbslam_jax.live.recorder import DROPPED
-from uwbslam_jax.settings import LidarSettings
+from uwbslam_jax.files import read_run
+from uwbslam_jax.live import DROPPED
 
 _WORDS = [sys.executable, "-m", "uwbslam_jax"]
 _SETTLED_S = 120.0
@@ -68,8 +66,8 @@ def _long_run(out: Path, seconds: float) -> list[Metric]:
     lost, taken = _scans(recording)
     again = out / "again"
     subprocess.run([*_WORDS, "run", str(recording), "-o", str(again), "--quiet"], check=True, stdout=subprocess.DEVNULL)
-    ours, theirs = (read_trajectory(folder / "trajectory.tum") for folder in (out, again))
-    differ = _differing(ours, theirs)
+    ours, theirs = read_run(out), read_run(again)
+    differ = _differing((ours.stamps, ours.poses), (theirs.stamps, theirs.poses))
     if differ:  # a seldom fault: nobody would see it again
         print(f"kept: {shutil.copytree(out, tempfile.mkdtemp(), dirs_exist_ok=True)}", file=sys.stderr)
     return [
@@ -96,10 +94,7 @@ def _faulty_run(folder: Path, seconds: float) -> list[Metric]:
     with _emulated(folder, truth) as (lidar, uwb):
         robot = ["--config", str(_robot_of_the_workshop(folder)), "--duration", str(seconds)]
         summary = _live(folder / "faulty", ["--lidar", lidar, "--uwb", uwb, *robot])
-    run = read_run(folder / "faulty")
-    told = evaluate(
-        run.stamps, run.poses, dict(zip(run.beacon_ids.tolist(), run.beacons, strict=True)), Truth.load(truth)
-    )
+    told = us.evaluate(folder / "faulty", truth)
     return [
         Metric("with faults: robot RMS", told["robot_rmse_m"], "m", "lower", 0.05),
         Metric("with faults: counted", float(sum(summary["dropped"].values())), ""),
@@ -124,7 +119,7 @@ def _kills(folder: Path, times: int) -> list[Metric]:
             killed = time.time_ns()
             os.kill(process.pid, signal.SIGKILL)
         (recording,) = set(out.glob("live-*.mcap")) - before
-        worst = max(worst, (killed - max(message.stamp for message in LogReader(recording))) / 1e9)
+        worst = max(worst, (killed - max(message.stamp for message in us.read(recording))) / 1e9)
         resumed += number > 0 or bool(before)
         time.sleep(1.0)  # recordings are named by the second
     last = _live(out, ["--emulate", "workshop", "--resume", str(out), "--duration", "8"])
@@ -178,17 +173,14 @@ def _emulated(folder: Path, truth: Path) -> Iterator[tuple[str, str]]:
 
 def _robot_of_the_workshop(folder: Path) -> Path:
     """A settings file with what a user would configure for this robot."""
-    from uwbslam_jax.files.settings_file import dump, from_dict
-    from uwbslam_jax.sim import make_scenario, settings_overrides
-
     path = folder / "robot.toml"
-    path.write_text(dump(from_dict(settings_overrides(make_scenario("workshop", 0, None)))), encoding="utf-8")
+    us.save_settings(us.simulate("workshop").settings, path)
     return path
 
 
 def _scans(recording: Path) -> tuple[int, int]:
     """Scans dropped after the first seconds, and all of that time."""
-    topic, counts = LidarSettings().topic, {}
+    topic, counts = us.LidarSettings().topic, {}
     with recording.open("rb") as file:
         reader = make_reader(file)
         begin = min(message.log_time for _, _, message in reader.iter_messages())

@@ -15,10 +15,9 @@ import numpy as np
 from jax import lax
 
 from benchmarks.metric import Metric, Report, exponent, ratio
-from uwbslam_jax import estimator
-from uwbslam_jax.estimator import compiled, state_vector
+from uwbslam_jax import LidarSettings, MapSettings, Settings, UwbSettings, estimator
+from uwbslam_jax.estimator import Config, compiled, make_config, make_params, state_vector
 from uwbslam_jax.measurements import Frame, Ranges, Scan, empty_frame
-from uwbslam_jax.settings import Config, LidarSettings, MapSettings, Settings, UwbSettings, make_config, make_params
 
 BEACONS = (3, 5, 10, 20, 50)
 BEAMS = (181, 361, 541, 1081, 2162)

@@ -14,18 +14,12 @@ import numpy as np
 from benchmarks.metric import Metric, Report, ratio
 
 _CHILD = """
-import sys, time
-from uwbslam_jax.process import prepare
-prepare()
-from uwbslam_jax import commands
-from uwbslam_jax.config import Settings
-from uwbslam_jax.mcap_log import LogReader
-from uwbslam_jax.run import CompileClock, Runner, fit_beams
-reader = LogReader(sys.argv[1])
-with CompileClock() as clock:
-    runner = Runner(fit_beams(Settings(), reader), clock)
-    for message in reader:
-        if runner.add(message) and runner.session.decided_at is not None:
+import sys
+import uwbslam_jax as us
+slam = us.Slam()
+with us.estimator.CompileClock() as clock:
+    for message in us.read(sys.argv[1]):
+        if any(update.decided for update in slam.add(message)):
             break
 print(clock.seconds)
 """
@@ -47,7 +41,7 @@ def measure(*, quick: bool) -> Report:
         cold, compiled = _timed(pose, environment)
         warm = min(_timed(pose, environment) for _ in range(1 if quick else 3))
     help_s = np.median([_timed([*words, "--help"])[0] for _ in range(_HELPS)])
-    imports = np.median([_timed([sys.executable, "-c", "import uwbslam_jax.commands"])[0] for _ in range(3)])
+    imports = np.median([_timed([sys.executable, "-c", "import uwbslam_jax.api"])[0] for _ in range(3)])
     metrics = [
         Metric("uwbslam --help", float(help_s), "s", "lower", 1.0),
         Metric("imports of a run", float(imports), "s", "lower"),

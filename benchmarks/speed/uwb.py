@@ -13,10 +13,9 @@ import numpy as np
 from jax import lax
 
 from benchmarks.metric import Metric, Report, ratio
-from uwbslam_jax import estimator
-from uwbslam_jax.estimator import motion, ranging, state_vector
+from uwbslam_jax import Settings, UwbSettings, estimator
+from uwbslam_jax.estimator import make_config, make_params, motion, ranging, state_vector
 from uwbslam_jax.measurements import Ranges, empty_frame
-from uwbslam_jax.settings import Settings, UwbSettings, make_config, make_params
 
 _BEACONS = np.array([[0.0, 0.0], [12.0, 0.0], [12.0, 19.0], [0.0, 19.0], [6.0, 9.0]])
 _PAIRS = np.array(list(combinations(range(6), 2)))

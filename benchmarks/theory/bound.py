@@ -22,10 +22,10 @@ from jax import lax
 from benchmarks.metric import Metric, Report
 from benchmarks.theory.bound_fused import fused
 from benchmarks.theory.bound_recursion import Covariances, recursion
-from uwbslam_jax.estimator import match_fusion, motion, ranging, state_vector
+from uwbslam_jax import Settings, UwbSettings
+from uwbslam_jax.estimator import make_config, make_params, match_fusion, motion, ranging, state_vector
 from uwbslam_jax.measurements import Ranges, empty_frame
-from uwbslam_jax.numerics.gaussian import Gaussian, symmetric_root
-from uwbslam_jax.settings import Settings, UwbSettings, make_config, make_params
+from uwbslam_jax.numerics import Gaussian, symmetric_root
 
 RUNS = 50
 _STEPS, _DT = 600, 0.1

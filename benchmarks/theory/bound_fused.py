@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
 
 import numpy as np
 
+import uwbslam_jax as us
 from benchmarks.metric import Metric
 from benchmarks.theory.bound_recursion import recursion
-from uwbslam_jax.api import run_messages
 from uwbslam_jax.estimator import match_fusion
 from uwbslam_jax.evaluation import align
-from uwbslam_jax.files.settings_file import from_dict
 from uwbslam_jax.numerics import wrapped
-from uwbslam_jax.settings import MapSettings
-from uwbslam_jax.sim import Scenario, make_scenario, settings_overrides, simulate
-from uwbslam_jax.sim.rays import strike
+from uwbslam_jax.sim import Scenario, strike
 
 _FIRST_SEED, _SECONDS = 500, 60.0
 _DT = 0.1
@@ -31,7 +27,7 @@ def fused(runs: int, bar: float) -> list[Metric]:
     """RMSE over bound of beacons and robot, and what the robot's is made of."""
     rows = []
     for seed in range(_FIRST_SEED, _FIRST_SEED + runs):
-        rows.append(_one(replace(make_scenario("hall", seed, _SECONDS))))
+        rows.append(_one(us.simulate("hall", seed, _SECONDS)))
         print(f"fused {seed}: {np.round(rows[-1], 5).tolist()}", file=sys.stderr, flush=True)
     beacons, robot, heading, online, online_heading, least_beacons, least_robot, least_heading = np.array(rows).T
     deg, floor = 180 / np.pi, match_fusion._MATCH_FLOOR
@@ -63,7 +59,7 @@ def fused(runs: int, bar: float) -> list[Metric]:
         ),
         Metric(
             "fused, robot's position: made of, a cell's own spread / bound",
-            MapSettings().resolution / np.sqrt(6) / rms(least_robot),
+            us.MapSettings().resolution / np.sqrt(6) / rms(least_robot),
             "x",
         ),
         Metric(
@@ -78,9 +74,10 @@ def fused(runs: int, bar: float) -> list[Metric]:
     ]
 
 
-def _one(made: Scenario) -> list[float]:
+def _one(simulation: us.Simulation) -> list[float]:
     """Mean squares of a run: beacons, robot and heading of the whole run, both as published, and the three bounds."""
-    result, truth = run_messages(list(simulate(made)), from_dict(settings_overrides(made)))
+    result = us.run(simulation)
+    truth = result.truth
     assert truth is not None
     into = align(result.stamps, result.poses, {}, truth)
     last = truth.beacon_positions()
@@ -92,10 +89,10 @@ def _one(made: Scenario) -> list[float]:
     for motion, track, target in ((into, result.poses, true), (published, result.online[known], true[known])):
         apart = motion.poses(track) - target
         found += [float(np.mean(np.sum(apart[:, :2] ** 2, axis=1))), float(np.mean(wrapped(apart[:, 2]) ** 2))]
-    return [*found, *_bound(made)]
+    return [*found, *_bound(simulation.scenario)]
 
 
-def _decided(result) -> int:
+def _decided(result: us.Result) -> int:
     return round(1e9 * (result.summary["decided_at"] or 0.0))
 
 

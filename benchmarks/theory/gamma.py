@@ -13,12 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
+import uwbslam_jax as us
 from benchmarks.metric import Metric, Report
-from uwbslam_jax.api import run_messages
-from uwbslam_jax.evaluation import evaluate
-from uwbslam_jax.settings import FilterSettings, Settings
-from uwbslam_jax.sim import Beacon, Lidar, Scenario, Uwb, make_scenario, simulate, spread, stream, worlds
-from uwbslam_jax.sim.paths import Along, Path as Way, Rest, Track
+from uwbslam_jax.sim import Beacon, Lidar, Scenario, Uwb, paths, spread, stream, worlds
 
 GAMMAS = (1e-6, 0.01, 0.1, 0.65, 3.0, 15.0, 100.0)
 _SEEDS = (700, 701)
@@ -35,7 +32,7 @@ def measure(*, quick: bool) -> Report:
     table: dict[tuple[str, str], np.ndarray] = {}
     for place in PLACES:
         for ranges in RANGES:
-            logs = [list(simulate(made(place, ranges, seed))) for seed in seeds]
+            logs = [list(us.Simulation(made(place, ranges, seed))) for seed in seeds]
             rms = [[_error(log, gamma) for log in logs] for gamma in gammas]
             table[place, ranges] = np.median(np.array(rms), axis=1)
             print(f"{place}, {ranges}: {np.round(table[place, ranges], 3).tolist()}", file=sys.stderr, flush=True)
@@ -69,11 +66,11 @@ def made(place: str, ranges: str, seed: int) -> Scenario:
     many = ranges == "many ranges"
     uwb = Uwb()
     if place == "corridor":
-        base = make_scenario("corridor_recess", seed)
+        base = us.simulate("corridor_recess", seed).scenario
         kept = base.beacons if many else base.beacons[::2]
         return replace(base, beacons=kept, uwb=uwb, lidar=Lidar(beams=361, reach=6.0))
     world = worlds.hall(seed, _SIZE_M)
-    track = Track(world.lap, 1.2, closed=True)
+    track = paths.Track(world.lap, 1.2, closed=True)
     spots = spread(world, track.sample(0.25), 5, stream(seed, "beacons"), apart=4.0)
     beacons = tuple(Beacon(k + 1, (float(x), float(y))) for k, (x, y) in enumerate(spots[: 5 if many else 3]))
     lidar = Lidar(beams=361)
@@ -81,18 +78,16 @@ def made(place: str, ranges: str, seed: int) -> Scenario:
         width, depth = _SIZE_M
         corners = worlds.box((0.5 * width, 0.5 * depth), (width, depth))
         world, lidar = replace(world, segments=worlds.polygon(corners), outline=corners), Lidar(beams=361, reach=8.0)
-    path = Way([Rest(4.0), Along(track, 0.0, 0.8 * _SECONDS)])
+    path = paths.Path([paths.Rest(4.0), paths.Along(track, 0.0, 0.8 * _SECONDS)])
     return Scenario(place, seed, _SECONDS, world, path, beacons, lidar, uwb)
 
 
 def _error(messages, gamma: float) -> float:
     """Robot RMS [m]; NaN where start-up decides nothing, or the state is not finite any more."""
-    settings = Settings(filter=FilterSettings(preset="paper", gamma=gamma))
-    result, truth = run_messages(messages, settings)
-    if result.summary["decided_at"] is None or truth is None or not np.isfinite(result.poses).all():
+    result = us.run(messages, us.Settings(filter=us.FilterSettings(preset="paper", gamma=gamma)))
+    if result.summary["decided_at"] is None or result.truth is None or not np.isfinite(result.poses).all():
         return float("nan")
-    beacons = {beacon.id: beacon.position for beacon in result.beacons}
-    return float(evaluate(result.stamps, result.poses, beacons, truth)["robot_rmse_m"])
+    return float(us.evaluate(result, result.truth)["robot_rmse_m"])
 
 
 def _draw(table: dict[tuple[str, str], np.ndarray], gammas: tuple[float, ...]) -> None:

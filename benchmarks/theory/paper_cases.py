@@ -9,12 +9,10 @@ import numpy as np
 
 from benchmarks.accuracy import intervals
 from benchmarks.accuracy.trials import Outcome, measure
+from uwbslam_jax import FilterSettings, MapImage, Result, Settings, simulate
 from uwbslam_jax.evaluation import rigid_fit
 from uwbslam_jax.numerics import wrapped
-from uwbslam_jax.result import MapImage, Result
-from uwbslam_jax.settings import FilterSettings, Settings
-from uwbslam_jax.sim import Scenario, make_scenario
-from uwbslam_jax.sim.paths import Along, Path, Rest, Track
+from uwbslam_jax.sim import Scenario, paths
 
 LENGTH = 22.7
 """Of the corridor [m]."""
@@ -111,14 +109,14 @@ _Run = tuple[str, Scenario, Outcome, Figures]
 
 
 def _workshop(seed: int) -> Iterator[_Run]:
-    made = _noisy(make_scenario("workshop", seed))
+    made = _noisy(simulate("workshop", seed).scenario)
     for setting, chosen in WORKSHOP.items():
         outcome = measure(made, Settings(filter=chosen))
         yield setting, made, outcome, _beacon_figures(outcome) | _of(outcome, "robot", "heading", "stray")
 
 
 def _dynamic(seed: int) -> Iterator[_Run]:
-    made = _noisy(make_scenario("schedule", seed))
+    made = _noisy(simulate("schedule", seed).scenario)
     for setting, chosen in DYNAMIC.items():
         outcome = measure(made, Settings(filter=chosen))
         seen = _seen(outcome, made)
@@ -127,17 +125,17 @@ def _dynamic(seed: int) -> Iterator[_Run]:
 
 
 def _speed(seed: int) -> Iterator[_Run]:
-    base = make_scenario("workshop", seed)
-    track = Track(base.world.lap, 1.2, closed=True)
+    base = simulate("workshop", seed).scenario
+    track = paths.Track(base.world.lap, 1.2, closed=True)
     for setting, (speed, rate, chosen) in SPEEDS.items():
-        path = Path([Rest(4.0), Along(track, 0.0, track.length, speed), Rest(1.0)])
+        path = paths.Path([paths.Rest(4.0), paths.Along(track, 0.0, track.length, speed), paths.Rest(1.0)])
         made = _noisy(replace(base, path=path, duration=path.duration), rate)
         outcome = measure(made, Settings(filter=chosen))
         yield setting, made, outcome, _of(outcome, "robot", "heading", "stray")
 
 
 def _corridor(seed: int) -> Iterator[_Run]:
-    base = make_scenario("corridor", seed)
+    base = simulate("corridor", seed).scenario
     first, second, *_ = intervals.stops(base)
     for setting, (sigma, rate, chosen) in CORRIDOR.items():
         made = _noisy(base, rate, sigma)

@@ -8,13 +8,16 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
+import uwbslam_jax as us
+from benchmarks.accuracy.trials import measure as run
 from benchmarks.metric import Metric, Report
 from benchmarks.theory.tuning_cost import cost
 from benchmarks.theory.tuning_links import links
-from uwbslam_jax.settings import Settings, UwbSettings
-from uwbslam_jax.sim import Lidar, Scenario, Uwb, Wheels, make_scenario, simulate
+from uwbslam_jax.sim import Lidar, Scenario, Uwb, Wheels
+from uwbslam_jax.tuning import Calibration
 
 _FIRST_SEED = 300
 """Other worlds than those of the scenario suite."""
@@ -48,23 +51,22 @@ def measure(*, quick: bool) -> Report:
 
 
 def recovery(quick: bool) -> Iterator[Metric]:
-    """NoiseFit sigma_n over the truth."""
-    from uwbslam_jax.tuning.fit import fit
-    from uwbslam_jax.tuning.likelihood import Objective, piece
-    from uwbslam_jax.tuning.rollout import prepare
-
-    names, seconds = ("sigma_n", "sigma_w"), []
+    """The sigma_n found over the true one."""
+    seconds = []
     for k, sigma in enumerate(_SIGMAS[: 1 if quick else None]):
-        messages = list(simulate(replace(make_scenario("hall", _FIRST_SEED + k, _SECONDS), uwb=Uwb(sigma=sigma))))
+        messages = list(us.Simulation(_hall(_FIRST_SEED + k, sigma)))
         for off in _OFF[: 1 if quick else None]:
             begin = time.perf_counter()
-            ready = prepare(messages, Settings(uwb=UwbSettings(sigma_n=off * sigma)))
-            found = fit(Objective([piece(ready)], names, np.log([off * sigma, 1.0])))
+            tuned = us.tune(messages, ("sigma_n", "sigma_w"), us.Settings(uwb=us.UwbSettings(sigma_n=off * sigma)))
             seconds.append(time.perf_counter() - begin)
             jax.clear_caches()  # compiled programs hold more memory maps than one process may have
-            error = 100 * abs(found.values[0] / sigma - 1)
+            error = 100 * abs(tuned.values["sigma_n"] / sigma - 1)
             yield Metric(f"sigma_n {sigma:g} m from {off:g} times it, error", error, "%", "lower", bar=3.0)
     yield Metric("the longest of these fits", max(seconds), "s", "lower", bar=180.0)
+
+
+def _hall(seed: int, sigma: float) -> Scenario:
+    return replace(us.simulate("hall", seed, _SECONDS).scenario, uwb=Uwb(sigma=sigma))
 
 
 def transfer(quick: bool) -> Iterator[Metric]:
@@ -72,7 +74,7 @@ def transfer(quick: bool) -> Iterator[Metric]:
     rows = [_pair(k) for k in range(1 if quick else _PAIRS)]
     count = float(len(rows))
     for k, (gain, robot, beacons) in enumerate(rows):
-        yield Metric(f"pair {k + 1}: log-likelihood gained a frame", gain, "", "higher")
+        yield Metric(f"pair {k + 1}: log-likelihood gained a measurement", gain, "", "higher")
         yield Metric(f"pair {k + 1}: robot RMS, tuned / default", robot, "x", "lower", bar=1.1)
         yield Metric(f"pair {k + 1}: beacons mean, tuned / default", beacons, "x", "lower", bar=1.1)
     yield Metric("pairs more likely", float(sum(row[0] > 0 for row in rows)), "", "higher", bar=count)
@@ -82,55 +84,40 @@ def transfer(quick: bool) -> Iterator[Metric]:
 
 def _pair(k: int) -> tuple[float, float, float]:
     """Gain in log-likelihood a frame, robot and beacons over what the defaults give."""
-    from benchmarks.accuracy.trials import measure as run
-    from uwbslam_jax.tuning import parameters
-    from uwbslam_jax.tuning.fit import fit
-    from uwbslam_jax.tuning.likelihood import Objective, piece
-    from uwbslam_jax.tuning.rollout import prepare
-
-    def hall(seed: int) -> Scenario:
-        return replace(make_scenario("hall", seed, _SECONDS), uwb=Uwb(sigma=_TRUE_N))
-
-    names, default = parameters.DEFAULTS["robust"], Settings()
-    start = np.log([parameters.value(default, name) for name in names])
-    found = fit(Objective([piece(prepare(list(simulate(hall(_FIRST_SEED + 40 + k))), default))], names, start))
-    tuned = parameters.configured(default, dict(zip(names, found.values.tolist(), strict=True)))
-    print(f"pair {k + 1}: {dict(zip(names, found.values.round(4).tolist(), strict=True))}", file=sys.stderr)
-    other = hall(_FIRST_SEED + 50 + k)
-    seen = Objective([piece(prepare(list(simulate(other)), default), held=0.0)], names, start)
-    gain = float(np.mean(_per_frame(seen, np.log(found.values)) - _per_frame(seen, start)))
-    before, after = run(other).figures, run(other, tuned).figures
+    tuned = us.tune(us.Simulation(_hall(_FIRST_SEED + 40 + k, _TRUE_N)), settings=us.Settings())
+    print(f"pair {k + 1}: {tuned.values}", file=sys.stderr)
+    other = _hall(_FIRST_SEED + 50 + k, _TRUE_N)
+    seen = us.rollout(us.Simulation(other), us.Settings())
+    params = seen.params._replace(**{name: jnp.float32(value) for name, value in tuned.values.items()})
+    gain = float(seen.loss(seen.params) - seen.loss(params))
+    before, after = run(other).figures, run(other, tuned.settings).figures
     jax.clear_caches()
     robot, beacons = (float(after[key] / before[key]) for key in ("robot_rmse_m", "beacon_mean_m"))
     return gain, robot, beacons
 
 
-def _per_frame(objective, logs: np.ndarray) -> np.ndarray:
-    told = objective.losses(objective.pieces[0], logs)
-    return -np.asarray(told.ranges + told.matches, float)
-
-
 def mounting(quick: bool) -> Iterator[Metric]:
     """Biases and the LiDAR's place, found from nothing."""
-    from uwbslam_jax.tuning.calibration import calibrate
 
-    errors, without = [], make_scenario("biased", _FIRST_SEED + 30)
+    def found(made: Scenario) -> Calibration:
+        names = [*(f"bias.{n}" for n in made.uwb.bias), *_LIDAR]
+        calibration = us.tune(us.Simulation(made), names, us.Settings()).calibration
+        assert calibration is not None
+        return calibration
 
-    def names(made: Scenario) -> list[str]:
-        return [*(f"bias.{n}" for n in made.uwb.bias), *_LIDAR]
+    def biased(seed: int) -> Scenario:
+        return replace(us.simulate("biased", _FIRST_SEED + 30 + seed).scenario, lidar=Lidar(pose=_MOUNTED))
+
+    errors = []
 
     for seed in range(1 if quick else 5):
-        made = replace(make_scenario("biased", _FIRST_SEED + 30 + seed), lidar=Lidar(pose=_MOUNTED), wheels=Wheels())
-        found = calibrate(list(simulate(made)), Settings(), names(made))
-        off = found.values - np.array([*made.uwb.bias.values(), *_MOUNTED])
+        made = replace(biased(seed), wheels=Wheels())
+        off = found(made).values - np.array([*made.uwb.bias.values(), *_MOUNTED])
         errors.append([np.sqrt(np.mean(off[:-3] ** 2)), np.hypot(*off[-3:-1]), np.rad2deg(abs(off[-1]))])
     for place, value in (("median", np.median(errors, axis=0)), ("worst", np.max(errors, axis=0))):
         of = f"{place} of {len(errors)} recordings"
         yield Metric(f"biases, RMS error, {of}", float(value[0]), "m", "lower", bar=0.03)
         yield Metric(f"LiDAR's offset, error, {of}", float(value[1]), "m", "lower", bar=0.02)
         yield Metric(f"LiDAR's yaw, error, {of}", float(value[2]), "deg", "lower", bar=0.1)
-    blind = calibrate(
-        list(simulate(replace(without, lidar=Lidar(pose=_MOUNTED)))), Settings(), names(without), passes=1
-    )
-    told = float(sum(how == "not observed" for how in blind.told))
+    told = float(sum(how == "not observed" for how in found(biased(0)).told))
     yield Metric("without wheels: parameters told as not observed (the yaw)", told, "", "higher", bar=1.0)

@@ -5,19 +5,18 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+import uwbslam_jax as us
 from benchmarks.metric import Metric
 from uwbslam_jax.estimator import state_vector
-from uwbslam_jax.mapping.tiled_map import TILE
-from uwbslam_jax.settings import Settings
-from uwbslam_jax.sim import Beacon, Scenario, simulate, spread, stream, worlds
-from uwbslam_jax.sim.paths import Along, Path, Rest, Track
-from uwbslam_jax.tuning import parameters
-from uwbslam_jax.tuning.rollout import checkpointed, cropped, losses, prepare, rescaled
+from uwbslam_jax.mapping import TILE
+from uwbslam_jax.sim import Beacon, Scenario, paths, spread, stream, worlds
+from uwbslam_jax.tuning import cropped
 
 _STEPS = 1521
 """39 chunks of 39, not below 1500."""
@@ -31,7 +30,7 @@ _NAMES = ("sigma_n", "sigma_w", "sigma_l")
 
 def cost(quick: bool) -> Iterator[Metric]:
     """Gradient over forward rollout, and the memory that the compiler sets aside for it."""
-    ready = prepare(list(simulate(_small_hall())), Settings())
+    ready = us.rollout(us.Simulation(_small_hall()), us.Settings())
     steps = 144 if quick else _STEPS
     assert ready.count >= steps
     frames = jax.tree.map(lambda x: x[:steps], ready.frames)
@@ -42,16 +41,15 @@ def cost(quick: bool) -> Iterator[Metric]:
     state = ready.state._replace(grid=cropped(ready.state.grid, config.resolution, origin, _CELLS))
 
     def total(logs, state, frames):
-        tuned = parameters.put(params, _NAMES, logs)
-        told = checkpointed(config, tuned, rescaled(tuned, params, state), frames)
-        return jnp.sum(told.ranges) + jnp.sum(told.matches)
+        tuned = params._replace(**dict(zip(_NAMES, jnp.exp(logs), strict=True)))
+        return ready._replace(config=config, state=state, frames=frames).loss(tuned)
 
     logs = jnp.log(jnp.array([float(getattr(params, name)) for name in _NAMES]))
     compiled = jax.jit(jax.value_and_grad(total)).lower(logs, state, frames).compile()
     memory = compiled.memory_analysis()
     assert memory is not None
     size = memory.temp_size_in_bytes + memory.output_size_in_bytes + memory.argument_size_in_bytes
-    forward = _seconds(lambda: losses(config, params, state, frames))
+    forward = _seconds(jax.jit(partial(total, logs, state, frames)))
     both = _seconds(lambda: compiled(logs, state, frames))
     yield Metric("cost: steps", float(steps), "")
     yield Metric("cost: forward rollout", forward, "s", "lower")
@@ -72,7 +70,9 @@ def _seconds(run: Callable[[], object]) -> float:
 
 def _small_hall() -> Scenario:
     world = worlds.hall(1, _HALL_M)
-    track = Track(world.lap, 1.2, closed=True)
+    track = paths.Track(world.lap, 1.2, closed=True)
     spots = spread(world, track.sample(0.25), 5, stream(1, "beacons"), apart=3.0)
     beacons = tuple(Beacon(k + 1, (float(x), float(y))) for k, (x, y) in enumerate(spots))
-    return Scenario("small hall", 1, _SECONDS, world, Path([Rest(4.0), Along(track, 0.0, _SECONDS)]), beacons)
+    return Scenario(
+        "small hall", 1, _SECONDS, world, paths.Path([paths.Rest(4.0), paths.Along(track, 0.0, _SECONDS)]), beacons
+    )

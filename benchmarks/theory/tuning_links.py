@@ -12,9 +12,8 @@ import optimistix as optx
 
 from benchmarks.accuracy.public_logs import P2P_OFFSET, p2p
 from benchmarks.metric import Metric
+from uwbslam_jax import RangeMessage, Settings
 from uwbslam_jax.estimator import ranging
-from uwbslam_jax.measurements import RangeMessage
-from uwbslam_jax.settings import Settings
 
 _DATA = Path(__file__).parents[3] / "shared" / "data" / "p2p"
 _FITTED = 0.75

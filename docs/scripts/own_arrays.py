@@ -1,12 +1,11 @@
 import numpy as np
 
 import uwbslam_jax as us
-from uwbslam_jax.measurements import RangeMessage, ScanMessage
 
 slam, log = us.Slam(), np.load("arrays.npz")
 for stamp, scan, ranges in zip(log["stamps"].tolist(), log["scans"], log["ranges"], strict=True):
     for beacon, distance in enumerate(ranges.tolist(), start=1):
-        slam.add(RangeMessage(stamp, 0, beacon, distance))
-    for update in slam.add(ScanMessage(stamp, log["angle"][0], np.ptp(log["angle"]) / 719, 0.0, 0.1, 30.0, scan)):
+        slam.add(us.RangeMessage(stamp, 0, beacon, distance))
+    for update in slam.add(us.ScanMessage(stamp, log["angle"][0], np.ptp(log["angle"]) / 719, 0.0, 0.1, 30.0, scan)):
         print(update.stamp, update.status, update.pose)
 slam.finish().save("out")

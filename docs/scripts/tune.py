@@ -1,7 +1,6 @@
 import uwbslam_jax as us
 
 tuned = us.tune([us.read("hall.mcap")], params=("sigma_n",))
-for name, value in zip(tuned.names, tuned.values, strict=True):
-    print(name, value)
+print(tuned.values)
 us.save_settings(tuned.settings, "tuned.toml")
 result = us.run("hall.mcap", us.load_settings("tuned.toml"))

@@ -97,7 +97,7 @@ def test_demo(tmp_path: Path) -> None:
     assert done.stderr == ""
     assert "robot, RMS" in done.stdout
     assert "report.html" in done.stdout
-    assert {path.name for path in (tmp_path / "out").iterdir()} == FILES | {"demo.mcap"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == FILES | {"state.npz", "demo.mcap"}
     found = read_run(tmp_path / "out")
     assert len(found.stamps) == 200
     assert found.summary["decided_at"] < 20
@@ -111,7 +111,7 @@ def test_demo(tmp_path: Path) -> None:
 
 class TestRun:
     def test_files(self, folder: Path) -> None:
-        assert {path.name for path in folder.iterdir()} == FILES
+        assert {path.name for path in folder.iterdir()} == FILES | {"state.npz"}
         summary = json.loads((folder / "summary.json").read_text())
         assert summary["steps"] == FRAMES
         assert summary["ids"] == [3, 5, 7, 9, 12]

@@ -23,9 +23,8 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from uwbslam_drivers.device import DriverError
 from uwbslam_jax import estimator
-from uwbslam_jax.errors import RunError
+from uwbslam_jax.errors import RunError, UsageError
 from uwbslam_jax.files import ros_types
 from uwbslam_jax.files.mcap_log import LogReader, LogWriter
 from uwbslam_jax.live.message_queue import BEHIND_S, MOST, OVERFULL, OVERTAKEN, Arrival, Inbox
@@ -267,7 +266,7 @@ def test_without_ranges_the_robot_is_where_it_was() -> None:
 def test_a_session_goes_on_from_a_saved_state() -> None:
     for fixed in (False, True):
         session = Session(SMALL)
-        saved_state.go_on(session, found_before(), np.array([1.0, 2.0]), T0, fixed=fixed)
+        session.go_on(found_before(), np.array([1.0, 2.0]), T0, fixed=fixed)
         assert session.decided_at == T0
         assert [session.beacon_status(slot) for slot in (1, 4)] == ["static", "static"]
         np.testing.assert_allclose(session.state.belief.mean[:2], [1.0, 2.0])
@@ -316,10 +315,10 @@ def test_a_viewer_gets_the_page_and_is_told_of_the_end() -> None:
 def test_a_taken_port_and_a_bad_address_are_one_line() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        with pytest.raises(DriverError, match=rf"live view at 127\.0\.0\.1:{port}: .* --view"):
+        with pytest.raises(UsageError, match=rf"live view at 127\.0\.0\.1:{port}: .* --view"):
             LiveView(LivePage("x"), "127.0.0.1", port)
     for bad in ("8765", "host:", "host:99999", ":80", "host:x"):
-        with pytest.raises(DriverError, match="must be HOST:PORT"):
+        with pytest.raises(UsageError, match="must be HOST:PORT"):
             parse_address(bad)
 
 
@@ -371,7 +370,7 @@ def test_published_poses_reach_a_foxglove_client() -> None:
             assert b"101" in stream.readline()
             while stream.readline().strip():
                 pass
-            publisher.step(session, frame, estimate)
+            publisher.step(session, session.update(frame, estimate))
             channels: dict[str, int] = {}
             while "/pose" not in channels:
                 _, payload = frame_of(stream)
@@ -382,7 +381,7 @@ def test_published_poses_reach_a_foxglove_client() -> None:
             client.settimeout(0.2)
             payload = b""
             for _ in range(50):  # until the subscription is in force
-                publisher.step(session, frame, estimate)
+                publisher.step(session, session.update(frame, estimate))
                 try:
                     opcode, payload = frame_of(stream)
                 except TimeoutError:

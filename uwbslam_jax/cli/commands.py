@@ -22,6 +22,7 @@ from uwbslam_jax.cli.live_command import LiveOptions, live
 from uwbslam_jax.cli.tune_command import TuneOptions, tune
 from uwbslam_jax.files import settings_file
 from uwbslam_jax.settings import Settings
+from uwbslam_jax.simulation import Simulation, simulate
 
 
 @dataclass
@@ -140,7 +141,7 @@ def run(options: RunOptions) -> None:
 def demo(options: DemoOptions) -> None:
     """The command `demo`."""
     options.out.mkdir(parents=True, exist_ok=True)
-    made = api.simulate("workshop", options.seed, options.duration)
+    made = simulate("workshop", options.seed, options.duration)
     log = options.out / "demo.mcap"
     _record(made, log, options.quiet)
     _run_and_write((log,), made.settings, options.out, "UWB and LiDAR SLAM demo", quiet=options.quiet)
@@ -148,7 +149,7 @@ def demo(options: DemoOptions) -> None:
 
 def simulate_scenario(options: SimulateOptions) -> None:
     """The command `simulate`."""
-    made = api.simulate(options.name, options.seed, options.duration)
+    made = simulate(options.name, options.seed, options.duration)
     _record(made, options.out, options.quiet)
     print(f"recording: {options.out} ({made.scenario.duration:.1f} s)")
     if made.settings != Settings():
@@ -196,7 +197,7 @@ def _run_and_write(
     deliver(result, out, title)
 
 
-def _record(made: api.Simulation, path: Path, quiet: bool) -> None:
+def _record(made: Simulation, path: Path, quiet: bool) -> None:
     """Writes the messages of a simulation."""
     scans = int(made.scenario.duration * made.scenario.lidar.rate)
     bar = tqdm(desc="simulate", unit="scan", total=scans, leave=False, disable=True if quiet else None)

@@ -21,3 +21,9 @@ from uwbslam_jax.estimator.state import (
     sight as sight,
 )
 from uwbslam_jax.estimator.step import step as step
+from uwbslam_jax.settings import (
+    Config as Config,
+    Params as Params,
+    make_config as make_config,
+    make_params as make_params,
+)

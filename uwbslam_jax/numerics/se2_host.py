@@ -10,7 +10,7 @@ import numpy as np
 Angle = TypeVar("Angle", float, np.ndarray)
 
 
-def turned(theta: np.ndarray | float, xy: np.ndarray) -> np.ndarray:
+def turned(theta: np.ndarray | np.floating | float, xy: np.ndarray) -> np.ndarray:
     """Vectors (..., 2) turned by angles (...) [rad]."""
     c, s = np.cos(theta), np.sin(theta)
     return np.stack([c * xy[..., 0] - s * xy[..., 1], s * xy[..., 0] + c * xy[..., 1]], axis=-1)

@@ -1,4 +1,4 @@
-"""One step as it is told to whoever asks: node ids in place of slots, host arrays. Nothing is computed until it is read."""
+"""One step as it is reported: node ids in place of slots, host arrays. Nothing is computed until it is read."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class Update:
         return found
 
     def scan_points(self, lidar: tuple[float, float, float], every: int = 1) -> np.ndarray:
-        """(n, 2) where the scan's beams end [m]. lidar: its pose on the robot [m, m, rad]; every: only each so many-th return."""
+        """(n, 2) where the scan's beams end [m]. See the function `scan_points` for the arguments."""
         return scan_points(self.frame.frame.scan, lidar, self.pose, self.velocity, every)
 
 

@@ -1,7 +1,7 @@
 """Worlds, devices and their faults, for recordings with ground truth."""
 
 from uwbslam_jax.sim.catalogue import SCENARIOS as SCENARIOS, make_scenario as make_scenario, spread as spread
-from uwbslam_jax.sim.rays import cast as cast
+from uwbslam_jax.sim.rays import cast as cast, strike as strike
 from uwbslam_jax.sim.scenario import (
     INF as INF,
     Beacon as Beacon,

@@ -81,7 +81,7 @@ class Rollout(NamedTuple):
         return float(self.stamps[-1] - self.stamps[0]) / 1e9
 
     def loss(self, params: Params) -> Float[Array, ""]:
-        """Negative log-likelihood of the ranges and matches, a measurement; differentiable, with the estimator's decisions
+        """Negative log-likelihood of the ranges and matches, a measurement; differentiable, the estimator's decisions
         held. params: see `Params`; those of the rollout where nothing is to be changed."""
         return _loss(self.config, params, self.params, self.state, self.frames)
 

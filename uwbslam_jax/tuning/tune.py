@@ -1,4 +1,4 @@
-"""What recordings tell of the parameters: geometry from the whole runs, then noises along rollouts; and that as a table."""
+"""What recordings tell of the parameters: geometry from whole runs, then noises along rollouts; and that as a table."""
 
 from __future__ import annotations
 
@@ -46,6 +46,12 @@ class Tuned:
     calibration: Calibration | None
     noises: NoiseFit | None
     objective: Objective | None
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Name -> what was found, of every parameter."""
+        parts = [part for part in (self.calibration, self.noises) if part is not None]
+        return {name: float(value) for part in parts for name, value in zip(part.names, part.values, strict=True)}
 
     def cuts(self) -> list[str]:
         """Why rollouts end before their recordings do."""
