@@ -48,7 +48,8 @@ FLOORS: dict[float, str] = {
     9: "__main__",
 }
 DRIVER_FLOORS: dict[float, str] = {
-    1: "device lines scip clock ports",
+    1: "device scip clock ports",
+    1.5: "lines",
     2: "hokuyo rplidar linktrack dwm1001 makerfabs dwm1000",
     3: "source",
     4: "__init__",

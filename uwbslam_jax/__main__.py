@@ -57,13 +57,12 @@ def _guarded(commands: ModuleType, words: list[str]) -> int:
         commands.call(words[0], words[1:])
     except BrokenPipeError:  # the reader of our output has closed it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except (UwbslamError, OSError) as error:
-        return _fail(f"{error.filename}: {error.strerror}" if _names_file(error) else str(error))
+    except UwbslamError as error:
+        return _fail(str(error))
+    except OSError as error:
+        named = error.filename is not None and error.strerror is not None
+        return _fail(f"{error.filename}: {error.strerror}" if named else str(error))
     return 0
-
-
-def _names_file(error: BaseException) -> bool:
-    return isinstance(error, OSError) and error.filename is not None and error.strerror is not None
 
 
 def _fail(text: str) -> int:
