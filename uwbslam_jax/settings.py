@@ -200,7 +200,7 @@ class FilterSettings:
     """The estimator."""
 
     preset: Literal["robust", "paper"] = "robust"
-    """robust: everything. paper: the paper as printed with its errata mended."""
+    """robust: everything. paper: the paper as printed with its errata corrected."""
     scan_matching: bool = True
     """Paper's case: without it the map is drawn at the UWB pose."""
     correction: bool = True

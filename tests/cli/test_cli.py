@@ -206,7 +206,7 @@ class TestRun:
     def test_a_beacon_that_left_keeps_its_last_place(self) -> None:
         session = Session(replace(SMALL, lidar=replace(SMALL.lidar, max_beams=BEAMS)))
         session.slots[77] = 1
-        session.history.left[1] = (np.array([1.0, 2.0]), np.eye(2) * 0.01)
+        session.history._left[1] = (np.array([1.0, 2.0]), np.eye(2) * 0.01)
         (beacon,) = to_result(session, Facts()).beacons
         assert (beacon.id, beacon.status, beacon.position.tolist()) == (77, "dropped", [1.0, 2.0])
 

@@ -108,10 +108,10 @@ def call(name: str, words: Sequence[str]) -> None:
       SystemExit: bad usage (status 2), or help was asked for (0); the text is printed.
     """
     options, run = _COMMANDS[name]
-    default = None
-    if options in (RunOptions, TuneOptions, LiveOptions):
-        fields = dataclasses.fields(options)
-        required = [f.name for f in fields if f.default is f.default_factory is dataclasses.MISSING]
+    default: Any = None
+    fields = {field.name: field for field in dataclasses.fields(options)}
+    if "settings" in fields:
+        required = [name for name, f in fields.items() if f.default is f.default_factory is dataclasses.MISSING]
         default = options(**dict.fromkeys(required, tyro.MISSING), settings=_settings_file(words))
     run(tyro.cli(options, args=list(words), default=default, prog=f"uwbslam {name}", description=options.__doc__))
 
