@@ -1,4 +1,4 @@
-"""The back end as a part of the host: collects every frame, solves the run so far beside it, and hands over what is news."""
+"""The back end as a part of the host: collects every frame, solves the run so far beside it, hands over what is news."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class BackEnd:
         return self._reviser.solved
 
     def add(self, host: HostParams, number: int, frame: StampedFrame, estimate: Estimate) -> None:
-        """Takes in one frame: not with the look, which would take longer for one frame in ten. number: in the history."""
+        """Takes in one frame, not with the look, which would take longer for one in ten. number: in the history."""
         if self.enabled:
             self.graph.add(host, number, frame, estimate)
 
