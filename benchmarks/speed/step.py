@@ -12,7 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.metric import Metric, Report, ratio, spread
-from uwbslam_jax.estimator import compiled, motion, ranging, state_vector, step as step_module
+from uwbslam_jax.estimator import compiled, matching, motion, ranging, state_vector
+from uwbslam_jax.estimator.state import Seen
+from uwbslam_jax.estimator.step import _match, _usable
 from uwbslam_jax.files.settings_file import from_dict
 from uwbslam_jax.mapping import grid
 from uwbslam_jax.mapping.sweep import undo_motion
@@ -118,15 +120,15 @@ def _parts(run: Session, frames: list[StampedFrame]) -> list[tuple[str, float]]:
     state = run.state
     s = state_vector.unpack(state.belief.mean)
     sweep = undo_motion(frame.scan, params.lidar, rotation(-s.heading) @ s.velocities[0], s.yaw_rate)
-    usable = step_module._usable(config, state, frame)
+    usable = _usable(config, state, frame)
 
     def filtered(state, frame):
         belief = motion.predict(state.belief, params, frame.dt, frame.odometry, state.moving, state.unrest)
         return ranging.update(belief, frame.ranges, usable, params, state.scatter, robust=True)
 
     def matched(state, sweep):
-        surface = sweep.surface(sweep)
-        return step_module._match(config, params, state, state.belief, sweep, surface, frame.has_scan)
+        seen = Seen(frame, usable, matching.view(sweep, params.sigma_l))
+        return _match(config, state, state.belief, seen)
 
     def redrawn(window, pose):
         return grid.integrate(window, pose, sweep, config.resolution)
