@@ -81,7 +81,7 @@ def live(options: LiveOptions) -> None:
     saved = None if started is None else saved_state.load(started, settings)
     options.out.mkdir(parents=True, exist_ok=True)
     with contextlib.ExitStack() as ends, _until_told(options.duration) as go:
-        page, publisher = _outputs(options, ends)
+        outputs = _outputs(options, ends)
         if devices is None:
             devices = Devices(*ends.enter_context(_emulators(str(options.emulate), options.out)))
         print("getting ready", flush=True)
@@ -89,15 +89,8 @@ def live(options: LiveOptions) -> None:
         if not go():
             raise KeyboardInterrupt
         recording = options.out / f"live-{datetime.now(UTC):%Y%m%d-%H%M%S}.mcap"
-        run = LiveRun(
-            settings,
-            devices,
-            recording,
-            page=page,
-            publisher=publisher,
-            saved=saved,
-            fixed=options.localize is not None,
-        )
+        fixed = options.localize is not None
+        run = LiveRun(settings, devices, recording, outputs=outputs, saved=saved, fixed=fixed)
         print(f"recording to {recording}; Ctrl-C ends", flush=True)
         result = run.run(go)
         if not result.summary["steps"]:

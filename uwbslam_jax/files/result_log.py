@@ -23,6 +23,8 @@ DIAGNOSTICS_PERIOD = 100_000_000  # at most 10 Hz [ns]
 PATH_PERIOD = 100_000_000  # at most 10 Hz [ns]: one message, for looking at; /tf has every pose
 BEACONS_PERIOD = 1_000_000_000  # about 1 Hz [ns]
 MAP_FRAME, UWB_FRAME = "map", "uwb"
+_CYLINDER, _TEXT = 3, 9
+"""Types of a visualization_msgs/Marker; a text faces the viewer."""
 _COLORS = {  # of a beacon, by status
     "static": (0.1, 0.6, 0.2),
     "moving": (0.9, 0.5, 0.0),
@@ -206,39 +208,27 @@ def _beacon(
     color = _COLORS.get(status, _COLORS["silent"])
     text = str(number) if status == "static" else f"{number} {status}"
     ellipse = tuple(max(4.0 * sigma, 0.01) for sigma in sigmas)  # 2 sigma to both sides, never invisible
-    return [
-        _marker(stamp, "beacon", number, 3, (x, y, 0.5), 0.0, (0.12, 0.12, 1.0), (*color, 1.0)),
-        _marker(stamp, "id", number, 9, (x, y, 1.3), 0.0, (0.0, 0.0, 0.4), (0.1, 0.1, 0.1, 1.0), text),
-        _marker(stamp, "sigma", number, 3, (x, y, 0.01), bearing, (*ellipse, 0.02), (*color, 0.4)),
+    shapes: list[tuple[Any, ...]] = [
+        ("beacon", _CYLINDER, (x, y, 0.5), 0.0, (0.12, 0.12, 1.0), (*color, 1.0), ""),
+        ("id", _TEXT, (x, y, 1.3), 0.0, (0.0, 0.0, 0.4), (0.1, 0.1, 0.1, 1.0), text),
+        ("sigma", _CYLINDER, (x, y, 0.01), bearing, (*ellipse, 0.02), (*color, 0.4), ""),
     ]
-
-
-def _marker(
-    stamp: int,
-    namespace: str,
-    number: int,
-    kind: int,
-    xyz: tuple[float, float, float],
-    yaw: float,
-    size: tuple[float, ...],
-    rgba: tuple[float, ...],
-    text: str = "",
-) -> Any:
-    """visualization_msgs/Marker; kind 3 is a cylinder, 9 a text that faces the viewer."""
-    place = build("geometry_msgs/msg/Pose", position=vector("Point", *xyz), orientation=quaternion(yaw))
-    return build(
-        "visualization_msgs/msg/Marker",
-        header=header(stamp, MAP_FRAME),
-        ns=namespace,
-        id=number & 0x7FFFFFFF,  # ids are uint32, a marker's number is int32
-        type=kind,
-        action=0,
-        pose=place,
-        scale=vector("Vector3", *size),
-        color=build("std_msgs/msg/ColorRGBA", **dict(zip("rgba", map(float, rgba), strict=True))),
-        text=text,
-        **_plain_marker(),
-    )
+    return [
+        build(
+            "visualization_msgs/msg/Marker",
+            header=header(stamp, MAP_FRAME),
+            ns=namespace,
+            id=number & 0x7FFFFFFF,  # ids are uint32, a marker's number is int32
+            type=kind,
+            action=0,
+            pose=build("geometry_msgs/msg/Pose", position=vector("Point", *xyz), orientation=quaternion(yaw)),
+            scale=vector("Vector3", *size),
+            color=build("std_msgs/msg/ColorRGBA", **dict(zip("rgba", map(float, rgba), strict=True))),
+            text=shown,
+            **_plain_marker(),
+        )
+        for namespace, kind, xyz, yaw, size, rgba, shown in shapes
+    ]
 
 
 @cache

@@ -53,23 +53,22 @@ class LiveRun:
         devices: Devices,
         recording: Path,
         *,
-        page: LivePage | None = None,
-        publisher: Publisher | None = None,
+        outputs: tuple[LivePage | None, Publisher | None] = (None, None),
         saved: Saved | None = None,
         fixed: bool = False,
     ):
         """Opens the recording.
 
         Args:
-          page, publisher: who is told of each step.
+          outputs: view and publisher that get each step.
           saved: go on from this; fixed: and only localise.
 
         Raises:
           LogError: the recording cannot be opened.
         """
         self.recording = recording
-        self._settings, self._devices, self._page, self._publisher = settings, devices, page, publisher
-        self._saved, self._fixed = saved, fixed
+        self._settings, self._devices, self._saved, self._fixed = settings, devices, saved, fixed
+        self._page, self._publisher = outputs
         self._locator = Locator(saved, settings) if saved is not None else None
         self._recorder = LogRecorder(recording, settings)
         self._inbox = Inbox(self._recorder.record)
