@@ -14,7 +14,7 @@ import numpy as np
 import uwbslam_jax as us
 from benchmarks.metric import Metric, Report, ratio, spread
 from uwbslam_jax.estimator import matching, motion, ranging, state_vector
-from uwbslam_jax.mapping import find_surface, grid, undo_motion
+from uwbslam_jax.mapping import grid, undo_motion
 from uwbslam_jax.measurements import StampedFrame
 from uwbslam_jax.numerics import Gaussian, rotation
 from uwbslam_jax.session import Session
@@ -110,12 +110,11 @@ def _parts(run: Session, last: StampedFrame) -> list[tuple[str, float]]:
         return ranging.update(belief, frame.ranges, usable, params, state.scatter, robust=True)
 
     def matched(state, sweep):
-        surface = find_surface(sweep)
         loose = C @ state.belief.cov @ C.T + jnp.diag(jnp.array(_LOOSE) ** 2)
         prior = Gaussian(C @ state.belief.mean, loose)
-        blind = matching.blind_direction(surface, sweep.valid)
-        pose = matching.align(state.grid, sweep, blind, prior.mean, prior, params.sigma_l, config.resolution, True)
-        return matching.assess(state.grid, sweep, surface, pose, config.resolution)
+        view = matching.view(sweep, params.sigma_l)
+        pose = matching.align(state.grid, view, prior.mean, prior, config.resolution, True)
+        return matching.assess(state.grid, view, pose, config.resolution)
 
     def redrawn(window, pose):
         return grid.integrate(window, pose, sweep, config.resolution)

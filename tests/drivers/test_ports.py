@@ -40,7 +40,7 @@ def served(
     """A device that is switched on now; its clock shows some time [ns] and runs too fast."""
     departure = Departure()
     device = EMULATORS[name](DeviceTime(host_time(), shows, 50.0))
-    server = Server(device, plug, made, departure, faults, drift=50.0, number=2)  # the first fault comes early
+    server = Server(device, plug, made, departure, faults, number=2)  # the first fault comes early
     server.start()
     try:
         yield server, departure

@@ -20,24 +20,23 @@ CELLS, LEVELS, RESOLUTION, BEAMS = 128, 3, 0.1, 180
 SIGMA_L = 0.25
 
 
-def blind_direction(sweep):
-    return matching.blind_direction(find_surface(sweep), sweep.valid)
+def view_of(sweep, sigma_l=SIGMA_L):
+    return matching.view(sweep, jnp.asarray(sigma_l, sweep.points.dtype))
 
 
 @partial(jax.jit, static_argnums=5)
 def align(grid, sweep, start, prior, sigma_l, resolution):
-    return matching.align(grid, sweep, blind_direction(sweep), start, prior, sigma_l, resolution)
+    return matching.align(grid, view_of(sweep, sigma_l), start, prior, resolution)
 
 
 @partial(jax.jit, static_argnums=3)
 def assess(grid, sweep, pose, resolution):
-    return matching.assess(grid, sweep, find_surface(sweep), pose, resolution)
+    return matching.assess(grid, view_of(sweep), pose, resolution)
 
 
 @partial(jax.jit, static_argnums=4)
 def search(grid, sweep, prior, sigma_l, resolution):
-    known = (prior.mean, prior.mean)
-    return matching.search(grid, sweep, find_surface(sweep), prior, known, sigma_l, resolution)
+    return matching.search(grid, view_of(sweep, sigma_l), prior, prior.mean, prior.mean, resolution)
 
 
 def sweep_at(pose, beams=BEAMS, walls=room.WALLS):
@@ -104,11 +103,11 @@ def test_a_map_that_pretends_to_know_the_way_along_a_corridor_is_not_believed():
 @pytest.mark.parametrize("heading", [0.0, 0.7, 2.0])
 def test_a_corridor_is_blind_along_its_walls_and_a_room_is_not(heading):
     corridor = np.array([[[-30.0, -1.05], [30.0, -1.05]], [[30.0, 1.05], [-30.0, 1.05]]])
-    blind = blind_direction(sweep_at((0.0, 0.2, heading), walls=corridor))
+    blind = view_of(sweep_at((0.0, 0.2, heading), walls=corridor)).blind
     assert float(blind.weight) == 1.0
     along = np.array([np.cos(heading), -np.sin(heading)])  # the x axis in the robot's frame
     np.testing.assert_allclose(abs(float(blind.direction @ along)), 1.0, atol=1e-3)  # 2.5 degrees
-    assert float(blind_direction(sweep_at((0.3, 0.2, heading))).weight) == 0.0
+    assert float(view_of(sweep_at((0.3, 0.2, heading))).blind.weight) == 0.0
 
 
 def test_the_end_of_a_corridor_tells_nothing_before_it_is_drawn():
@@ -220,12 +219,7 @@ def test_gradient_of_an_alignment_agrees_with_finite_differences(room_map):
 def test_from_nearby_fewer_beams_and_moves_find_the_same_place(room_map):
     truth = np.array([0.33, -0.41, 0.6])
     sweep, start = sweep_at(truth, 1081), jnp.asarray(truth + np.array([0.02, -0.015, 0.004]), jnp.float32)
-    found = [
-        matching.align(
-            room_map, sweep, blind_direction(sweep), start, wide(start), jnp.float32(SIGMA_L), RESOLUTION, near
-        )
-        for near in (False, True)
-    ]
+    found = [matching.align(room_map, view_of(sweep), start, wide(start), RESOLUTION, near) for near in (False, True)]
     for pose in found:
         np.testing.assert_allclose(pose, truth, atol=0.01)  # a tenth of a cell, half of what is asked from afar
     assert len(matching.thinned(sweep, 540).valid) < 600

@@ -167,10 +167,8 @@ def take_over(config: Config, params: Params, revision: Revision, state: State, 
     slots, places, at = _current(solution, graph)
     last = graph.poses()[count - 1]
     poses = np.concatenate([solution.poses, compose(solution.poses[-1], between(last, graph.poses()[count:]))])
-    grid = revision.grid
-    way = float(state.map_spread.way)
-    for pose, snapshot in graph.seen(poses, count):
-        grid = draw_onto(config, params, revision.tiles, grid, pose, snapshot, way)
+    seen, way = graph.seen(poses, count), float(state.map_spread.way)
+    grid = draw_onto(config, params, revision.tiles, revision.grid, seen, way)
     s = state_vector.unpack(state.belief.mean)
     old = np.asarray(state_vector.robot_pose(state.belief.mean), float)
     on_map = old + np.asarray(s.map_error, float)
@@ -179,7 +177,7 @@ def take_over(config: Config, params: Params, revision: Revision, state: State, 
     cov = _cov(solution, at, pose, float(np.sum(np.hypot(*np.diff(poses[count - 1 :, :2], axis=0).T))))
     others = [slot for slot in map(int, np.flatnonzero(np.asarray(state.active))) if slot > 0 and slot not in slots]
     values = np.concatenate([pose, places.ravel()])
-    belief = anchored(state.belief, config.nodes, values, cov, slots, old, others)
+    belief = anchored(state.belief, values, cov, slots, others)
     # a buffer of its own: the step donates its state
     spread = state.map_spread._replace(epoch=state.map_spread.way + 0.0)
     graph.put(poses, 0.0)

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from uwbslam_jax.estimator.state import Estimate, State, init
 from uwbslam_jax.estimator.step import step as step_frame
@@ -27,10 +27,8 @@ T = TypeVar("T")
 
 TRACES: Counter[str] = Counter()
 """How often each compiled function was traced, by name; a test counts them."""
-
-
 GROUP = 10
-"""So many frames at most."""
+"""Frames of one call at most."""
 
 
 def step(config: Config, params: Params, state: State, frames: Sequence[Frame]) -> tuple[State, list[Estimate]]:
@@ -43,8 +41,8 @@ def step(config: Config, params: Params, state: State, frames: Sequence[Frame]) 
     packed = np.zeros((GROUP, packing.size), np.float32)
     for row, frame in zip(packed[: len(frames)], frames, strict=True):
         packing.pack(frame, row)
-    state, told = _step(config, params, state, packed, np.int32(len(frames)))
-    return state, [estimates.unpack(row) for row in np.asarray(told)[: len(frames)]]
+    state, reported = _step(config, params, state, packed, np.int32(len(frames)))
+    return state, [estimates.unpack(row) for row in np.asarray(reported)[: len(frames)]]
 
 
 @cache
@@ -57,19 +55,21 @@ def _packings(config: Config) -> tuple[Packing[Frame], Packing[Estimate]]:
 
 
 def _reported(estimate: Estimate) -> Estimate:
-    """What the host is told: what only gradients ask for is left out, and so it is not computed."""
+    """What the host gets: what only gradients ask for is left out, and so it is not computed."""
     return estimate._replace(match_log_likelihood=None)
 
 
 @partial(jax.jit, static_argnums=0, donate_argnums=2)
-def _step(config, params, state, frames, count):
+def _step(
+    config: Config, params: Params, state: State, frames: Float[Array, "G f"], count: Int[Array, ""]
+) -> tuple[State, Float[Array, "G e"]]:
     TRACES["step"] += 1
     packing, estimates = _packings(config)
 
-    def one(k, carry):
-        state, told = carry
+    def one(k: Int[Array, ""], carry: tuple[State, Float[Array, "G e"]]) -> tuple[State, Float[Array, "G e"]]:
+        state, reported = carry
         state, estimate = step_frame(config, params, state, packing.unpack(frames[k]))
-        return state, told.at[k].set(estimates.pack_device(_reported(estimate)))
+        return state, reported.at[k].set(estimates.pack_device(_reported(estimate)))
 
     return lax.fori_loop(0, count, one, (state, jnp.zeros((GROUP, estimates.size))))
 

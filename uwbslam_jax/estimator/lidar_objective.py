@@ -1,8 +1,9 @@
-"""Whitened residual blocks of the joint objective (paper eq. (opt); DESIGN 1.4): LiDAR, UWB, prior."""
+"""Whitened residual blocks of the joint objective (paper eq. (opt)): LiDAR, UWB, prior."""
 
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -56,7 +57,9 @@ def lidar_residual(
 
 
 @partial(lidar_residual.defjvp, symbolic_zeros=True)
-def _lidar_residual_jvp(primals, tangents):
+def _lidar_residual_jvp(
+    primals: tuple[Any, ...], tangents: tuple[Any, ...]
+) -> tuple[Float[Array, "4"], Float[Array, "4"]]:
     pose, *others = primals
     R = _root(lidar_gram(pose, *others))
     out = jnp.zeros_like(R[:, 3])
@@ -66,10 +69,12 @@ def _lidar_residual_jvp(primals, tangents):
     if all(isinstance(t, SymbolicZero) for t in tangents[1:5]):
         return R[:, 3], out
 
-    def of_rest(level, origin, points):
+    def of_rest(
+        level: Float[Array, "c c"], origin: Float[Array, "2"], points: Float[Array, "B 2"]
+    ) -> Float[Array, "4"]:
         return _root(lidar_gram(pose, level, origin, size, points, valid))[:, 3]
 
-    def dense(t, x):
+    def dense(t: Array | SymbolicZero, x: Array) -> Array:
         return jnp.zeros_like(x) if isinstance(t, SymbolicZero) else t
 
     rest = (level, origin, points)

@@ -1,4 +1,4 @@
-"""What a match is worth: how surprising it is, whether a jump of the robot explains it, and its fusion.
+"""The information of a match: how surprising it is, whether a jump of the robot explains it, and its fusion.
 
 A match is weighed against what was expected of it. Where a scan that is sure of itself contradicts the expectation,
 the robot's motion was not what its velocity said: stamps that come late, a bump, a turn between two scans. Then the
@@ -134,7 +134,7 @@ def _information(match: Match, params: Params, beams: Int[Array, ""]) -> Float[A
 
 
 def fuse(belief: Gaussian, match: Match, information: Float[Array, "3 3"]) -> Gaussian:
-    """EKF update by a matched pose, of which the map's own error is a part (match hard, fuse soft; DESIGN 1.9)."""
+    """EKF update by a matched pose, of which the map's own error is a part (match hard, fuse soft)."""
     C = state_vector.matched_pose_jacobian(state_vector.node_count(belief.mean.shape[0]))
     innovation, _ = _innovation(match, belief)
     return update_projected(belief, C, information, innovation)
@@ -216,7 +216,7 @@ def contradicted(
     pose, velocity = jnp.array(state_vector.pose_indices(k)), jnp.array([2 * k, 2 * k + 1])
     robots = usable & ((ranges.i == 0) | (ranges.j == 0))
 
-    def misfit(vector):
+    def misfit(vector: Float[Array, "n"]) -> Float[Array, ""]:
         z = (ranges.range - ranging.predicted_ranges(vector, ranges, params)) / (2 * params.sigma_n)
         return jnp.sum(jnp.where(robots, z**2 / (1 + z**2 / 9.0), 0.0))
 

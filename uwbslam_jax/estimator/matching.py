@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,22 +13,23 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
 from uwbslam_jax.estimator.lidar_objective import lidar_gram, lidar_residual, prior_residual
-from uwbslam_jax.mapping import Grid, Surface, Sweep, grid as occupancy
+from uwbslam_jax.mapping import Grid, Surface, Sweep, find_surface, grid as occupancy
 from uwbslam_jax.numerics import Gaussian, rotation, symmetric_root, transform_points, wrap_angle
 
-_MOVES = (6, 5, 5)
-"""Gauss-Newton moves at the finest, middle and every coarser level, at most."""
-_STILL = 0.005
-"""A level is done when a move is shorter than this many of its cells [cells of m or rad]."""
+_STEPS = (6, 5, 5)
+"""Gauss-Newton steps at the finest, middle and every coarser level, at most."""
+_CONVERGED = 0.005
+"""A level has converged when a step is shorter than this many of its cells [cells of m or rad]."""
 _NEARBY_BEAMS = 540
 """A scan that is nearly in place needs no more beams than this: neighbours hit the same cell."""
-_NEARBY_MOVES, _NEARBY_STILL = 3, 0.02
-"""Nor more moves, and what its last is shorter than [cells of m or rad]."""
+_NEARBY_STEPS, _NEARBY_CONVERGED = 3, 0.02
+"""Nor more steps, nor a last one as short as from afar [cells of m or rad]."""
 _CHECKED_BEAMS = 360
-"""And more than this do not tell how well it fits where it was expected."""
+"""So many beams score the expected pose as well as all of them do."""
 _BLIND = (0.006, 0.02)
 """Share of normals in the least seen direction below which a scan is blind in it, and above which it is not."""
 _SEARCH_HEADINGS, _SEARCH_BEAMS, _SEARCH_REFINED = 120, 180, 8
+"""Headings of a search, 3 degrees apart for an alignment to converge; beams that score them; best ones aligned."""
 _UNLIKELY = 0.005
 """What a squared Mahalanobis distance of one costs a searched place, in mean Gamma: as if 100 beams were independent.
 Headings cost little: the search is for a robot that turned."""
@@ -66,7 +68,7 @@ class Blind(NamedTuple):
 
 
 def blind_direction(surface: Surface, counted: Bool[Array, "B"]) -> Blind:
-    """From the scan alone: the least eigenvector of the mean n n^T of its surface normals (DESIGN 1.8).
+    """From the scan alone: the least eigenvector of the mean n n^T of its surface normals.
 
     The map cannot tell. The cells of a straight wall form a pattern along it, to which a scan locks: HectorSLAM
     shortens corridors.
@@ -102,7 +104,7 @@ def share_of_walls(
       some: beams on the walls asked about, a part of those `counted`.
     """
 
-    def gram(beams):
+    def gram(beams: Bool[Array, "B"]) -> Float[Array, "2 2"]:
         t = jnp.where(beams & surface.found, surface.tangent, 0.0)
         normal = jnp.stack([t[1], -t[0]])
         return normal @ normal.T
@@ -110,6 +112,27 @@ def share_of_walls(
     R = rotation(heading)
     few = _BLIND[0] * jnp.maximum(jnp.sum(counted), 1)
     return R @ jnp.linalg.solve(gram(counted) + few * jnp.eye(2), gram(some & counted)) @ R.T
+
+
+class View(NamedTuple):
+    """A scan as it is matched.
+
+    Attributes:
+      sweep: in the robot's frame; surface: what it meets.
+      blind: the direction in which it does not tell the position.
+      sigma_l: standard deviation of a beam's residual 1 - Gamma.
+    """
+
+    sweep: Sweep
+    surface: Surface
+    blind: Blind
+    sigma_l: Float[Array, ""]
+
+
+def view(sweep: Sweep, sigma_l: Float[Array, ""]) -> View:
+    """What can be said of a scan without the map."""
+    surface = find_surface(sweep)
+    return View(sweep, surface, blind_direction(surface, sweep.valid), sigma_l)
 
 
 class _LidarAndPrior(NamedTuple):
@@ -133,34 +156,47 @@ def _residual(pose: Float[Array, "3"], a: _LidarAndPrior) -> Float[Array, "7"]:
     return jnp.concatenate([lidar, prior_residual(pose, a.mean, a.root)])
 
 
-class _GaussNewton(optx.GaussNewton):
-    """Gauss-Newton that stops by the length of a move alone, and takes that move.
+class _GaussNewton(optx.AbstractLeastSquaresSolver):
+    """Gauss-Newton that stops by the length of a step alone, and does not take one that is not finite.
 
-    Optimistix also waits until no entry of the residual changes any more, which those of a Gram matrix's root never do:
-    where the pose is right they pass through zero. And it evaluates once more after the last move.
+    That of optimistix also waits until no entry of the residual changes any more, which those of a Gram matrix's root
+    never do: where the pose is right they pass through zero. And it evaluates once more after the last step.
     """
 
-    def __init__(self, still: float):
-        super().__init__(rtol=0.0, atol=still, linear_solver=lx.Normal(lx.Cholesky()))
+    atol: float
+    rtol: float = 0.0
+    norm: Callable[[Array], Array] = optx.max_norm
 
-    def terminate(self, fn, y, args, options, state, tags):
-        move = state.descent_state.newton
-        return (state.num_steps > 0) & (jnp.max(jnp.abs(move)) < self.atol), state.result
+    def init(self, fn: Callable, y: Array, *_: Any) -> Array:
+        return jnp.full_like(y, jnp.inf)
 
-    def postprocess(self, fn, y, aux, args, options, state, tags, result):
-        return jnp.where(jnp.all(jnp.isfinite(state.y_eval)), state.y_eval, y), aux, {}
+    def step(self, fn: Callable, y: Array, args: Any, *_: Any) -> tuple[Array, Array, Any]:
+        residual, jacobian, aux = jax.linearize(lambda y: fn(y, args), y, has_aux=True)
+        J = lx.FunctionLinearOperator(jacobian, jax.eval_shape(lambda: y))
+        move = lx.linear_solve(J, residual, lx.Normal(lx.Cholesky()), throw=False).value
+        move = jnp.where(jnp.all(jnp.isfinite(move)), move, 0.0)
+        return y - move, move, aux
+
+    def terminate(
+        self, fn: Callable, y: Array, args: Any, options: dict, state: Array, tags: frozenset
+    ) -> tuple[Array, optx.RESULTS]:
+        return self.norm(state) < self.atol, optx.RESULTS.successful
+
+    def postprocess(self, fn: Callable, y: Array, aux: Any, *_: Any) -> tuple[Array, Any, dict]:
+        return y, aux, {}
 
 
-def gauss_newton(residual, start, args, moves: int, still: float = 0.0):
-    """Least squares by `moves` Gauss-Newton moves of optimistix at most; never raises, returns the last iterate. A move
-    of which every coordinate is shorter than `still` is the last."""
-    adjoint = optx.RecursiveCheckpointAdjoint()
-    solver = _GaussNewton(still)
-    return optx.least_squares(residual, solver, start, args=args, max_steps=moves, throw=False, adjoint=adjoint).value
+def gauss_newton(
+    residual: Callable[..., Float[Array, "r"]], start: Float[Array, "d"], args: Any, steps: int, still: float = 0.0
+) -> Float[Array, "d"]:
+    """Least squares by so many Gauss-Newton steps at most; never raises, returns the last iterate. A step of which
+    every coordinate is shorter than `still` is the last. residual: of the unknowns (d,) and args."""
+    adjoint, solver = optx.RecursiveCheckpointAdjoint(), _GaussNewton(atol=still)
+    return optx.least_squares(residual, solver, start, args=args, max_steps=steps, throw=False, adjoint=adjoint).value
 
 
 def thinned(sweep: Sweep, most: int = _CHECKED_BEAMS) -> Sweep:
-    """Every so manieth beam, about as many as asked for."""
+    """Every n-th beam, about as many as asked for."""
     n = max(1, sweep.valid.shape[0] // most)
     few = sweep._replace(points=sweep.points[::n], valid=sweep.valid[::n], reach=sweep.reach[::n])
     return few._replace(bearing_step=n * sweep.bearing_step)
@@ -168,53 +204,54 @@ def thinned(sweep: Sweep, most: int = _CHECKED_BEAMS) -> Sweep:
 
 def align(
     grid: Grid,
-    sweep: Sweep,
-    blind: Blind,
+    view: View,
     start: Float[Array, "3"],
     prior: Gaussian,
-    sigma_l: Float[Array, ""],
     resolution: float,
     near: bool | Bool[Array, ""] = False,
 ) -> Float[Array, "3"]:
-    """Pose that minimises 1/2 sum (1 - Gamma)^2 / sigma_l^2 + the prior's quadratic, coarse to fine (DESIGN 1.4).
+    """Pose that minimises 1/2 sum (1 - Gamma)^2 / sigma_l^2 + the prior's quadratic, coarse to fine
+    (docs/estimator.md, "The step").
 
     Args:
       near: the start is within a cell of the answer: the coarser levels would only lead away from it and back, and
         fewer beams will do.
     """
+    sweep = view.sweep
     root = solve_triangular(symmetric_root(prior.cov), jnp.eye(3, dtype=start.dtype), lower=True)
-    projector = seen(blind, start[2])
+    projector = seen(view.blind, start[2])
 
-    def at_level(k: int, beams: Sweep, pose, moves: int, still: float):
+    def at_level(k: int, beams: Sweep, pose: Float[Array, "3"], steps: int, converged: float) -> Float[Array, "3"]:
         size = jnp.asarray(resolution * 2**k, pose.dtype)
         # fewer beams weigh as much as all of them
         weight = jnp.sqrt(jnp.asarray(beams.valid.shape[0] / sweep.valid.shape[0], pose.dtype))
         scan = (grid.levels[k], grid.origin, size, beams.points, beams.valid)
-        args = _LidarAndPrior(*scan, prior.mean, root, sigma_l * weight, projector)
-        return gauss_newton(_residual, pose, args, moves, still * resolution * 2**k)
+        args = _LidarAndPrior(*scan, prior.mean, root, view.sigma_l * weight, projector)
+        return gauss_newton(_residual, pose, args, steps, converged * resolution * 2**k)
 
-    def from_nearby(pose):
-        return at_level(0, thinned(sweep, _NEARBY_BEAMS), pose, _NEARBY_MOVES, _NEARBY_STILL)
+    def from_nearby(pose: Float[Array, "3"]) -> Float[Array, "3"]:
+        return at_level(0, thinned(sweep, _NEARBY_BEAMS), pose, _NEARBY_STEPS, _NEARBY_CONVERGED)
 
-    def from_afar(pose):
+    def from_afar(pose: Float[Array, "3"]) -> Float[Array, "3"]:
         for k in reversed(range(len(grid.levels))):
-            pose = at_level(k, sweep, pose, _MOVES[min(k, 2)], _STILL)
+            pose = at_level(k, sweep, pose, _STEPS[min(k, 2)], _CONVERGED)
         return pose
 
     return jax.lax.cond(near, from_nearby, from_afar, start)
 
 
-def assess(grid: Grid, sweep: Sweep, surface: Surface, pose: Float[Array, "3"], resolution: float) -> Match:
+def assess(grid: Grid, view: View, pose: Float[Array, "3"], resolution: float) -> Match:
     """Score and information of a pose against the finest level.
 
     There is no information in the direction in which what the map has of the scan's walls is blind: the end of a
     corridor tells nothing before it is drawn.
     """
+    sweep = view.sweep
     gram = lidar_gram(pose, grid.levels[0], grid.origin, resolution, sweep.points, sweep.valid)
     score, known = fit(grid, sweep, pose, resolution)
     ends = transform_points(pose, sweep.points)
     on_wall, _ = on_known_wall(grid, ends, resolution, min(1, len(grid.levels) - 1))
-    informed = seen(blind_direction(surface, sweep.valid & on_wall), pose[2])
+    informed = seen(blind_direction(view.surface, sweep.valid & on_wall), pose[2])
     projector = jnp.eye(3).at[:2, :2].set(informed)
     information = projector @ gram[:3, :3] @ projector
     return Match(pose, information, informed, score, known)
@@ -244,37 +281,35 @@ def on_known_wall(
 
 def search(
     grid: Grid,
-    sweep: Sweep,
-    surface: Surface,
-    prior: Gaussian,
-    known: tuple[Float[Array, "3"], Float[Array, "3"]],
-    sigma_l: Float[Array, ""],
+    view: View,
+    expected: Gaussian,
+    last: Float[Array, "3"],
+    found: Float[Array, "3"],
     resolution: float,
 ) -> Float[Array, "3"]:
-    """Best pose over the full circle of headings and two patches of positions (DESIGN 1.8): around the prior's mean,
-    and around the last pose, because a robot that turned has often driven less far than its velocity said.
+    """Best pose over the full circle of headings and two patches of positions: around the mean of what is expected, and
+    around the last pose, because a robot that turned has often driven less far than its velocity said.
 
     Every heading and position is scored at the middle level; the best of each peak over the headings is aligned and
     scored at the finest, where it has to be better than the pose that was found without searching.
 
     Args:
-      prior: mean and covariance of the pose expected; its position weighs in the choice, its heading does not.
-      known: the last pose, and the pose found without searching.
+      expected: pose; its position weighs in the choice, its heading does not.
+      last: pose; found: without searching.
     """
-    last, found = known
-    blind = blind_direction(surface, sweep.valid)
+    sweep = view.sweep
     k = min(1, len(grid.levels) - 1)
     size = resolution * 2**k
     stride = max(1, sweep.points.shape[0] // _SEARCH_BEAMS)
     points, valid = sweep.points[::stride], sweep.valid[::stride]
-    spread = jnp.clip(1.5 * jnp.sqrt(jnp.maximum(prior.cov[0, 0], prior.cov[1, 1])), 0.05, 0.6)
+    spread = jnp.clip(1.5 * jnp.sqrt(jnp.maximum(expected.cov[0, 0], expected.cov[1, 1])), 0.05, 0.6)
     axis = jnp.linspace(-1.0, 1.0, 5)
     patch = jnp.stack(jnp.meshgrid(axis, axis), axis=-1).reshape(-1, 2) * spread
-    centres = jnp.stack([prior.mean[:2], last[:2]])
+    centres = jnp.stack([expected.mean[:2], last[:2]])
     places = (centres[:, None] + patch[None]).reshape(-1, 2)
-    headings = prior.mean[2] + jnp.linspace(-jnp.pi, jnp.pi, _SEARCH_HEADINGS, endpoint=False)
+    headings = expected.mean[2] + jnp.linspace(-jnp.pi, jnp.pi, _SEARCH_HEADINGS, endpoint=False)
 
-    def scores(heading):
+    def scores(heading: Float[Array, ""]) -> Float[Array, "p"]:
         c, s = jnp.cos(heading), jnp.sin(heading)
         turned = jnp.stack([c * points[:, 0] - s * points[:, 1], s * points[:, 0] + c * points[:, 1]], axis=-1)
         ends = (turned[None] + places[:, None]).reshape(-1, 2)
@@ -290,17 +325,17 @@ def search(
     _, best = jax.lax.top_k(jnp.where(peak, value, -jnp.inf), _SEARCH_REFINED)
     starts = jnp.concatenate([places[best_place[best]], headings[best, None]], axis=1)
     starts = jnp.concatenate([found[None], starts])
-    information = jnp.linalg.inv(prior.cov[:2, :2])
+    information = jnp.linalg.inv(expected.cov[:2, :2])
 
-    def refine(start):
+    def refine(start: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, ""]]:
         wide = Gaussian(start, jnp.diag(jnp.array([0.3, 0.3, 0.3]) ** 2))
-        pose = align(grid, sweep, blind, start, wide, sigma_l, resolution)
-        m = assess(grid, sweep, surface, pose, resolution)
+        pose = align(grid, view, start, wide, resolution)
+        m = assess(grid, view, pose, resolution)
         away = pose[None, :2] - centres
-        turned = wrap_angle(pose[2] - jnp.stack([prior.mean[2], last[2]])) / _TURN
+        turned = wrap_angle(pose[2] - jnp.stack([expected.mean[2], last[2]])) / _TURN
         unlikely = jnp.min(jnp.sum((away @ information) * away, axis=1)) + jnp.min(turned**2)
         return pose, (m.score - 0.5) * m.known - _UNLIKELY * unlikely
 
     poses, values = jax.lax.map(refine, starts)
     pose = poses[jnp.argmax(values)]
-    return pose.at[2].set(prior.mean[2] + wrap_angle(pose[2] - prior.mean[2]))
+    return pose.at[2].set(expected.mean[2] + wrap_angle(pose[2] - expected.mean[2]))

@@ -35,7 +35,8 @@ def transition(
     return _put_robot(state_vector.pack(beacons), _robot_transition(_take_robot(vector), dt, odometry))
 
 
-def _coast(dt):
+def _coast(dt: Float[Array, ""]) -> Float[Array, ""]:
+    """Time for which the velocity counts as kept in a gap of dt [s]."""
     return _COAST_S * (1.0 - jnp.exp(-dt / _COAST_S))
 
 
@@ -126,7 +127,7 @@ def predict(
     F_robot = jax.jacfwd(_robot_transition)(_take_robot(belief.mean), dt, odometry)
     coast = _coast(dt)
 
-    def carry(rows):
+    def carry(rows: Float[Array, "n m"]) -> Float[Array, "n m"]:
         """F @ rows: a beacon's place moves by its velocity if it is carried, the robot's rows as its transition."""
         velocities = jnp.where(jnp.repeat(moving, 2)[:, None], rows[2 * k : 4 * k], 0.0)
         beacons = jnp.concatenate([rows[: 2 * k] + coast * velocities, velocities, rows[4 * k :]])

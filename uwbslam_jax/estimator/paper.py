@@ -1,7 +1,7 @@
-"""Preset "paper": the paper's own steps as printed, with errata 1-4 of DESIGN 1.6 mended.
+"""Preset "paper": the paper's own steps as printed, with errata 1-4 of docs/estimator.md mended.
 
 One process noise for every node, heading from the robot's velocity, a frame pinned to two beacons in every step, the
-joint objective without prior, and a correction of the means. `slam.step` puts these in place of its own.
+joint objective without prior, and a correction of the means. `step` puts these in place of its own.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from uwbslam_jax.estimator import matching, ranging, state_vector
 from uwbslam_jax.estimator.lidar_objective import lidar_residual
 from uwbslam_jax.estimator.matching import Match
-from uwbslam_jax.mapping import Grid, Sweep
+from uwbslam_jax.estimator.state import Seen, State
 from uwbslam_jax.measurements import Ranges
 from uwbslam_jax.numerics import Gaussian, gauge_pose, gaussian, rotation
 from uwbslam_jax.settings import Params
@@ -109,27 +109,19 @@ def free_coordinates(active: Bool[Array, "K"], frame_slots: Int[Array, "2"]) -> 
     return jnp.append(free, 1.0)
 
 
-def joint_match(
-    grid: Grid,
-    sweep: Sweep,
-    belief: Gaussian,
-    ranges: Ranges,
-    usable: Bool[Array, "M"],
-    free: Float[Array, "d"],
-    params: Params,
-    resolution: float,
-) -> Float[Array, "d"]:
+def joint_match(params: Params, state: State, belief: Gaussian, seen: Seen, resolution: float) -> Float[Array, "d"]:
     """The offset that minimises eq. (opt), coarse to fine from the EKF's estimate.
 
     Each move is (H_lid + gamma H_uwb)^-1 (M_lid - gamma M_uwb); the paper's eq. (delta_opt) has both signs of gamma
     flipped (erratum 1).
     """
+    free = free_coordinates(state.active, state.frame_slots)
     delta = jnp.zeros(free.shape[0], belief.mean.dtype)
-    for k in reversed(range(len(grid.levels))):
+    sweep, ranges = seen.view.sweep, seen.frame.ranges
+    for k, level in reversed(list(enumerate(state.grid.levels))):
         size = jnp.asarray(resolution * 2**k, belief.mean.dtype)
-        args = _Joint(
-            grid.levels[k], grid.origin, size, sweep.points, sweep.valid, belief.mean, ranges, usable, free, params
-        )
+        lidar = (level, state.grid.origin, size, sweep.points, sweep.valid)
+        args = _Joint(*lidar, belief.mean, ranges, seen.usable, free, params)
         delta = matching.gauss_newton(joint_residual, delta, args, 5)
     return delta * free
 

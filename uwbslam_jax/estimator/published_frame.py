@@ -18,8 +18,11 @@ def frame_motion(beacons: np.ndarray, slots: Sequence[Hashable], frame_slots: Se
     return np.append(-rotation_matrix(theta) @ origin, theta)
 
 
-def published(x: np.ndarray, *, slots, frame_slots, onward) -> np.ndarray:
-    """Robot pose now and beacons in the published frame, from the last keyframe and beacons in the start frame."""
+def published(
+    x: np.ndarray, *, slots: Sequence[Hashable], frame_slots: Sequence[Hashable], onward: np.ndarray
+) -> np.ndarray:
+    """Robot pose now and beacons in the published frame (3 + 2 B,), from the last keyframe and beacons in the start
+    frame; onward: (3,) the robot's motion since [m, m, rad]."""
     beacons = x[3:].reshape(-1, 2)
     motion = frame_motion(beacons, slots, frame_slots)
     robot = compose(motion, compose(x[:3], onward))
@@ -27,13 +30,7 @@ def published(x: np.ndarray, *, slots, frame_slots, onward) -> np.ndarray:
 
 
 def anchored(
-    belief: Gaussian,
-    nodes: int,
-    values: np.ndarray,
-    cov: np.ndarray,
-    slots: list[int],
-    old_pose: np.ndarray,
-    apart: Sequence[int] = (),
+    belief: Gaussian, values: np.ndarray, cov: np.ndarray, slots: Sequence[int], apart: Sequence[int] = ()
 ) -> Gaussian:
     """State vector and covariance from robot pose and beacons (3 + 2 B,); velocities turn with the frame.
 
@@ -41,13 +38,14 @@ def anchored(
     reports what the track already says, and only the ranges can tell the two apart.
 
     Args:
-      slots: of the beacons; old_pose: (3,) of the robot in the belief. apart: slots that are to stay as they are.
+      values, cov: (3 + 2 B,), (3 + 2 B, 3 + 2 B). slots: of the beacons. apart: slots that are to stay as they are.
     """
     mean, P = np.array(belief.mean, float), np.array(belief.cov, float)
+    nodes = state_vector.node_count(len(mean))
     pose, error = np.array(state_vector.pose_indices(nodes)), np.array(state_vector.map_error_indices(nodes))
     velocity, beacon_velocities = np.arange(2 * nodes, 2 * nodes + 2), np.arange(2 * nodes + 2, 4 * nodes)
     placed = np.concatenate([[2 * s, 2 * s + 1] for s in slots])
-    R = rotation_matrix(values[2] - old_pose[2])
+    R = rotation_matrix(values[2] - mean[pose[2]])
     mean[velocity] = R @ mean[velocity]
     moving = np.append(velocity, 4 * nodes + 1)
     motion_cov = P[np.ix_(moving, moving)]

@@ -16,14 +16,14 @@ from uwbslam_jax.settings import Params
 
 _SOFT = 3.0
 """Normalised innovation at which a range weighs a quarter (Geman-McClure)."""
-
-
 _QUIET = 1.6
 """A pair that scatters less than this many times as much as its radios should is taken to be quiet."""
 _LEARN = 0.1
 """Logarithm by which a pair's scatter moves with one range, at most twice that apart: some 40 ranges for a factor 8."""
 _NORMAL_MEDIAN = 0.674
+"""Median of |x| for a standard normal x."""
 _SCATTER_LIMITS = (-0.7, 2.5)
+"""Of the logarithm: half as much as expected, and twelve times as much."""
 _ASTRAY, _ASTRAY_M = 0.02, 20.0
 """For the likelihood: so many ranges are anything within so many metres of what was expected."""
 _LOUDEST = 10.0
@@ -65,7 +65,7 @@ class _Geometry(NamedTuple):
     ends: Float[Array, "M K"]
 
 
-def _geometry(vector, ranges, params) -> _Geometry:
+def _geometry(vector: Float[Array, "n"], ranges: Ranges, params: Params) -> _Geometry:
     s = state_vector.unpack(vector)
     slot = jnp.arange(s.positions.shape[0])
     i, j = ranges.i[:, None] == slot[None, :], ranges.j[:, None] == slot[None, :]

@@ -1,4 +1,4 @@
-"""What a step carries to the next, and what it reports."""
+"""What a step carries to the next, what it is shown, and what it reports."""
 
 from __future__ import annotations
 
@@ -10,16 +10,18 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from uwbslam_jax.estimator import match_fusion, ranging, state_vector
+from uwbslam_jax.estimator.matching import View
 from uwbslam_jax.mapping import Grid, grid as occupancy
+from uwbslam_jax.measurements import Frame
 from uwbslam_jax.numerics import Gaussian
 from uwbslam_jax.settings import Config
 
 _SEEN_M = 0.05
-"""A match that tells the position no better than this in some direction does not see it."""
+"""A match that tells the position no better than this in some direction does not observe it [m]."""
 
 
 class State(NamedTuple):
-    """All that a step carries to the next; n = 4 K + 5, see `layout`.
+    """All that a step carries to the next; n = 4 K + 5, see `state_vector`.
 
     Attributes:
       belief: over the state vector.
@@ -30,8 +32,9 @@ class State(NamedTuple):
       grid: the map's window.
       drawn_pose: (3,) where the last scan was drawn.
       scans_drawn: how many were.
-      map_spread: of the map's errors from place to place, see trust.MapSpread.
-      unrest: variance of the motion between two scans that no velocity explains, see trust.learn_unrest [m^2, rad^2].
+      map_spread: of the map's errors from place to place, see match_fusion.MapSpread.
+      unrest: variance of the motion between two scans that no velocity explains [m^2, rad^2], see
+        match_fusion.learn_unrest.
     """
 
     belief: Gaussian
@@ -44,6 +47,14 @@ class State(NamedTuple):
     scans_drawn: Int[Array, ""]
     map_spread: match_fusion.MapSpread
     unrest: Float[Array, "2"]
+
+
+class Seen(NamedTuple):
+    """What a frame shows: its measurements, which of its ranges are used, and its scan without the robot's motion."""
+
+    frame: Frame
+    usable: Bool[Array, "M"]
+    view: View
 
 
 class Estimate(NamedTuple):
@@ -117,11 +128,11 @@ def map_pose(estimate: Estimate) -> np.ndarray:
 
 
 def sight(estimate: Estimate) -> float:
-    """What a match told of the position: NaN for all of it, inf for nothing, else the direction that it cannot see, in
-    the map's frame [rad]."""
+    """What a match observed of the position: NaN for all of it, inf for nothing, else the direction that it does not
+    observe, in the map's frame [rad]."""
     (xx, xy), (_, yy) = estimate.information[:2, :2].tolist()
     mean, spread = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)  # the eigenvalues are mean -+ spread
     if mean - spread > _SEEN_M**-2:
         return math.nan
-    along = 0.5 * math.atan2(2 * xy, xx - yy)  # where most is seen
+    along = 0.5 * math.atan2(2 * xy, xx - yy)  # where it is observed best
     return along + 0.5 * math.pi if mean + spread > _SEEN_M**-2 else math.inf

@@ -3,7 +3,7 @@
     positions (K, 2) m | velocities (K, 2) m/s | heading rad | yaw rate rad/s | map error (3,) m, m, rad
 
 K = 1 + max_beacons nodes; slot 0 is the robot. The map error is what the map's own drift adds to a matched pose:
-a match reports pose + map error (DESIGN 1.9: a match is against a map that the robot's own past poses drew).
+a match reports pose + map error, for it is against a map that the robot's own past poses drew.
 """
 
 from __future__ import annotations

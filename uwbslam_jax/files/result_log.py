@@ -23,6 +23,8 @@ DIAGNOSTICS_PERIOD, PATH_PERIOD, BEACONS_PERIOD = 100_000_000, 100_000_000, 1_00
 """Least time between two values, poses of the path, and beacons [ns]: for looking at; /tf has every pose."""
 MAP_FRAME, UWB_FRAME = "map", "uwb"
 """Frames [name]: the fixed one (REP 105), and that of recorded ranges at the same place, or viewers miss it."""
+_CYLINDER, _TEXT = 3, 9
+"""Types of a visualization_msgs/Marker [number]; a text faces the viewer."""
 _COLORS = {
     BeaconStatus.STATIC: (0.1, 0.6, 0.2),
     BeaconStatus.MOVING: (0.9, 0.5, 0.0),
@@ -202,39 +204,27 @@ def _beacon(
     color = _COLORS.get(status, _COLORS[BeaconStatus.SILENT])
     text = str(number) if status is BeaconStatus.STATIC else f"{number} {status}"
     ellipse = tuple(max(4.0 * sigma, 0.01) for sigma in sigmas)  # 2 sigma to both sides, never invisible
-    return [
-        _marker(stamp, "beacon", number, 3, (x, y, 0.5), 0.0, (0.12, 0.12, 1.0), (*color, 1.0)),
-        _marker(stamp, "id", number, 9, (x, y, 1.3), 0.0, (0.0, 0.0, 0.4), (0.1, 0.1, 0.1, 1.0), text),
-        _marker(stamp, "sigma", number, 3, (x, y, 0.01), bearing, (*ellipse, 0.02), (*color, 0.4)),
+    shapes: list[tuple[Any, ...]] = [
+        ("beacon", _CYLINDER, (x, y, 0.5), 0.0, (0.12, 0.12, 1.0), (*color, 1.0), ""),
+        ("id", _TEXT, (x, y, 1.3), 0.0, (0.0, 0.0, 0.4), (0.1, 0.1, 0.1, 1.0), text),
+        ("sigma", _CYLINDER, (x, y, 0.01), bearing, (*ellipse, 0.02), (*color, 0.4), ""),
     ]
-
-
-def _marker(
-    stamp: int,
-    namespace: str,
-    number: int,
-    kind: int,
-    xyz: tuple[float, float, float],
-    yaw: float,
-    size: tuple[float, ...],
-    rgba: tuple[float, ...],
-    text: str = "",
-) -> Any:
-    """visualization_msgs/Marker; kind 3 is a cylinder, 9 a text that faces the viewer."""
-    place = build("geometry_msgs/msg/Pose", position=vector("Point", *xyz), orientation=quaternion(yaw))
-    return build(
-        "visualization_msgs/msg/Marker",
-        header=header(stamp, MAP_FRAME),
-        ns=namespace,
-        id=number & 0x7FFFFFFF,  # ids are uint32, a marker's number is int32
-        type=kind,
-        action=0,
-        pose=place,
-        scale=vector("Vector3", *size),
-        color=build("std_msgs/msg/ColorRGBA", **dict(zip("rgba", map(float, rgba), strict=True))),
-        text=text,
-        **_plain_marker(),
-    )
+    return [
+        build(
+            "visualization_msgs/msg/Marker",
+            header=header(stamp, MAP_FRAME),
+            ns=namespace,
+            id=number & 0x7FFFFFFF,  # ids are uint32, a marker's number is int32
+            type=kind,
+            action=0,
+            pose=build("geometry_msgs/msg/Pose", position=vector("Point", *xyz), orientation=quaternion(yaw)),
+            scale=vector("Vector3", *size),
+            color=build("std_msgs/msg/ColorRGBA", **dict(zip("rgba", map(float, rgba), strict=True))),
+            text=shown,
+            **_plain_marker(),
+        )
+        for namespace, kind, xyz, yaw, size, rgba, shown in shapes
+    ]
 
 
 @cache

@@ -180,23 +180,21 @@ def _fast_range(options: Options) -> Decoder:
         except (struct.error, IndexError, ValueError):
             options.dropped["range: malformed"] += 1
             return []
-        return _ranges(stamp, source, target, values[0], values[1], values[2], options)
+        return _checked(RangeMessage(stamp, source, target, *values), options)
 
     return decode
 
 
-def _ranges(
-    stamp: int, source: int, target: int, distance: float, receive: float, first_path: float, options: Options
-) -> list[Message]:
+def _checked(found: RangeMessage, options: Options) -> list[Message]:
     """The one range as a list, empty and counted where it cannot be a distance between two nodes."""
-    if not 0.0 < distance < math.inf:
+    if not 0.0 < found.range < math.inf:
         options.dropped["range: not finite or not positive"] += 1
-    elif distance > options.max_range:
+    elif found.range > options.max_range:
         options.dropped[f"range: over {options.max_range:g} m"] += 1
-    elif source == target:
+    elif found.source == found.target:
         options.dropped["range: from a node to itself"] += 1
     else:
-        return [RangeMessage(stamp, source, target, distance, receive, first_path)]
+        return [found]
     return []
 
 
@@ -229,18 +227,19 @@ def _take_scan(message: Any, log_time: int, options: Options) -> list[Message]:
 
 
 def _take_ranges(message: Any, log_time: int, options: Options) -> list[Message]:
-    stamp, nan = _stamp(message, log_time), math.nan
+    stamp = _stamp(message, log_time)
     if hasattr(message, "nodes"):
         found: list[Message] = []
         for node in message.nodes:
-            powers = float(node.rx_rssi), float(node.fp_rssi)
-            found += _ranges(stamp, int(message.id), _linktrack_id(message, node), float(node.dis), *powers, options)
+            measured = float(node.dis), float(node.rx_rssi), float(node.fp_rssi)
+            found += _checked(RangeMessage(stamp, int(message.id), _linktrack_id(message, node), *measured), options)
         return found
     if hasattr(message, "to_id"):
         source = int(getattr(message, "from_id", options.robot_id))
-        return _ranges(stamp, source, int(message.to_id), float(message.range), nan, nan, options)
-    powers = [float(getattr(message, name, nan)) for name in ("receive_power", "first_path_power")]
-    return _ranges(stamp, int(message.source), int(message.target), float(message.range), powers[0], powers[1], options)
+        return _checked(RangeMessage(stamp, source, int(message.to_id), float(message.range)), options)
+    powers = [float(getattr(message, name, math.nan)) for name in ("receive_power", "first_path_power")]
+    nodes = int(message.source), int(message.target)
+    return _checked(RangeMessage(stamp, *nodes, float(message.range), *powers), options)
 
 
 def _linktrack_id(frame: Any, node: Any) -> int:

@@ -1,6 +1,6 @@
 """Occupancy pyramid: log-odds cells, bilinear lookup with its gradient, and the update by one scan.
 
-A fixed window of the world on the device; what lies outside it is kept by `tiles`. Level l has cells of
+A fixed window of the world on the device; what lies outside it is kept by `tiled_map`. Level l has cells of
 resolution * 2^l and covers the same square. Cell (row, col) is centred at origin + ((col, row) + 0.5) * size.
 """
 
@@ -18,11 +18,13 @@ from jaxtyping import Array, Bool, Float, Int
 from uwbslam_jax.mapping.sweep import Sweep
 
 HIT = float(np.log(0.9 / 0.1))
+"""Log-odds of a return in a cell (HectorSLAM's update factor 0.9)."""
 FREE = float(np.log(0.4 / 0.6))
-"""Log-odds of one observation (HectorSLAM's update factors 0.9 and 0.4)."""
+"""Log-odds of a beam through a cell (HectorSLAM's update factor 0.4)."""
 CLAMP = (-2.5, 4.0)
 """Bounds of a cell, so that a door that closes is learnt within a few scans."""
 EPOCH_LEVEL = 4
+"""Epochs are kept by patches of 16 x 16 finest cells: drift differs from room to room, not from cell to cell."""
 FREE_REACH_M = 12.8
 """Free space is carved this far from the sensor; returns are drawn as far as the window goes."""
 
@@ -54,6 +56,7 @@ def empty(cells: int, levels: int, resolution: float) -> Grid:
 
 
 _WINDOW = lax.GatherDimensionNumbers(offset_dims=(1, 2), collapsed_slice_dims=(), start_index_map=(0, 1))
+"""Gathers the 2 x 2 cells that begin at [row, col]."""
 
 
 def corner_log_odds(
@@ -106,7 +109,10 @@ def epoch_seen(grid: Grid, ends: Float[Array, "B 2"], valid: Bool[Array, "B"], r
     return jnp.sum(epoch) / jnp.maximum(jnp.sum(epoch > 0), 1)
 
 
-def _epoch_cells(grid, ends, valid, resolution):
+def _epoch_cells(
+    grid: Grid, ends: Float[Array, "B 2"], valid: Bool[Array, "B"], resolution: float
+) -> tuple[Int[Array, "B"], Int[Array, "B"], Bool[Array, "B"]]:
+    """Row and col of the patches that beams end on, and whether they are in the window."""
     cells = grid.epochs.shape[0]
     cell = jnp.floor((ends - grid.origin[None]) / (resolution * 2**EPOCH_LEVEL)).astype(jnp.int32)
     inside = valid & jnp.all((cell >= 0) & (cell < cells), axis=-1)
@@ -127,14 +133,10 @@ def integrate(
     x = pose[0] + c * sweep.points[:, 0] - s * sweep.points[:, 1]
     y = pose[1] + s * sweep.points[:, 0] + c * sweep.points[:, 1]
     ends = jnp.stack([x, y], axis=-1)
-    sensor = pose[:2] + jnp.stack(
-        [c * sweep.sensor[0] - s * sweep.sensor[1], s * sweep.sensor[0] + c * sweep.sensor[1]]
-    )
-    yaw = pose[2] + sweep.sensor[2]
-    levels = []
-    for k, level in enumerate(grid.levels):
-        size = resolution * 2**k
-        levels.append(_integrate_level(level, grid.origin, size, ends, sensor, yaw, sweep))
+    sx, sy = c * sweep.sensor[0] - s * sweep.sensor[1], s * sweep.sensor[0] + c * sweep.sensor[1]
+    sensor = jnp.stack([pose[0] + sx, pose[1] + sy, pose[2] + sweep.sensor[2]])
+    placed = sweep._replace(points=ends, sensor=sensor)
+    levels = [_integrate_level(x, grid.origin, resolution * 2**k, placed) for k, x in enumerate(grid.levels)]
     row, col, inside = _epoch_cells(grid, ends, sweep.valid, resolution)
     before = grid.epochs[row, col]
     first = jnp.where(before > 0, before, epoch)
@@ -142,13 +144,16 @@ def integrate(
     return Grid(tuple(levels), grid.origin, epochs)
 
 
-def _integrate_level(level, origin, size, ends, sensor, yaw, sweep):
+def _integrate_level(
+    level: Float[Array, "c c"], origin: Float[Array, "2"], size: float, sweep: Sweep
+) -> Float[Array, "c c"]:
+    """One level after a scan given in the map's frame."""
     cells = level.shape[0]
     half = min(int(FREE_REACH_M / size), cells // 2)
     bearing, distance = _polar_tables(half, size)
-    middle = jnp.round((sensor - origin) / size).astype(jnp.int32)
+    middle = jnp.round((sweep.sensor[:2] - origin) / size).astype(jnp.int32)
     start = jnp.clip(middle - half, 0, cells - 2 * half)
-    cell = jnp.floor((ends - origin[None]) / size).astype(jnp.int32)
+    cell = jnp.floor((sweep.points - origin[None]) / size).astype(jnp.int32)
     inside = sweep.valid & jnp.all((cell >= 0) & (cell < cells), axis=-1)
     clipped = jnp.clip(cell, 0, cells - 1)
     struck = jnp.clip(level[clipped[:, 1], clipped[:, 0]] + HIT, *CLAMP)
@@ -158,7 +163,7 @@ def _integrate_level(level, origin, size, ends, sensor, yaw, sweep):
     bearing = _shifted(bearing, shift)
     distance = _shifted(distance, shift)
     # a sensor outside the window is beyond the shifted tables: it frees nothing
-    free = _passed(bearing, distance, yaw, size, sweep) & jnp.all((middle >= 0) & (middle <= cells))
+    free = _passed(bearing, distance, size, sweep) & jnp.all((middle >= 0) & (middle <= cells))
     block = jnp.where(free, jnp.maximum(block + FREE, CLAMP[0]), block)
     # adds nothing, but what is written now needs what was read of the level before: without, XLA keeps a copy for it
     block = block + 0.0 * struck[0]
@@ -175,10 +180,13 @@ def _shifted(table: np.ndarray, shift: Int[Array, "2"]) -> Float[Array, "h h"]:
     return lax.dynamic_slice(padded, (at[1], at[0]), (h, h))
 
 
-def _passed(bearing, distance, yaw, size, sweep):
+def _passed(
+    bearing: Float[Array, "h h"], distance: Float[Array, "h h"], size: float, sweep: Sweep
+) -> Bool[Array, "h h"]:
+    """Which cells, by their bearing and distance from the sensor [rad, m], both beams beside them pass."""
     beams = sweep.reach.shape[0]
     # a LiDAR mounted upside down sweeps clockwise: its bearings count the other way
-    relative = (bearing - yaw - sweep.bearing0) * jnp.sign(sweep.bearing_step)
+    relative = (bearing - sweep.sensor[2] - sweep.bearing0) * jnp.sign(sweep.bearing_step)
     turn = 2 * jnp.pi
     # the first beam's bearing is 0; bearings just below it belong to no beam
     relative = relative - turn * jnp.floor(relative / turn)

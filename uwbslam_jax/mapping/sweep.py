@@ -7,11 +7,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from uwbslam_jax.measurements import Scan
 
 _NEIGHBOURS = (1, 2, 4, 8, 16)
+"""Distances to the neighbours that a normal is tried with, the nearest first [beams]."""
 _GAPS = (1, 2, 4, 8, 16)
 """A gap is closed from either side in such strides: up to 31 beams of it [beams]."""
 _NORMAL_SPAN = (0.25, 1.0)
@@ -44,7 +45,7 @@ def find_surface(sweep: Sweep) -> Surface:
     before, after = jnp.pad(before, pad), jnp.pad(after, pad)
     before_valid, after_valid, wide_valid = (jnp.pad(a, most) for a in (before_valid, after_valid, valid))
 
-    def shifted(a, k):
+    def shifted(a: Shaped[Array, "*d P"], k: int) -> Shaped[Array, "*d B"]:
         return a[..., most + k : most + k + beams]
 
     tangent, found = jnp.zeros_like(own), jnp.zeros_like(valid)
@@ -77,8 +78,10 @@ def stand_ins(valid: Bool[Array, "B"]) -> tuple[Int[Array, "B"], Bool[Array, "B"
     return jnp.where(nearer, before, after), has_before | has_after
 
 
-def _continued(values, valid, way):
-    """Values (n, B) with the last valid one carried on into gaps, towards higher beams (way 1) or lower (way -1), and
+def _continued(
+    values: Shaped[Array, "d B"], valid: Bool[Array, "B"], way: int
+) -> tuple[Shaped[Array, "d B"], Bool[Array, "B"]]:
+    """Values with the last valid one carried on into gaps, towards higher beams (way 1) or lower (way -1), and
     where they are valid then."""
     for stride in (stride for stride in _GAPS if stride < valid.shape[0]):
         values = jnp.where(valid[None], values, jnp.roll(values, way * stride, axis=-1))

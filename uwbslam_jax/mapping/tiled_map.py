@@ -11,6 +11,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from uwbslam_jax.mapping import grid as occupancy
 from uwbslam_jax.mapping.grid import EPOCH_LEVEL, Grid
@@ -19,6 +20,8 @@ from uwbslam_jax.measurements import Snapshot
 from uwbslam_jax.result import MapImage
 from uwbslam_jax.settings import Config, Params
 
+Posed = tuple[np.ndarray, Snapshot]
+"""A scan to be drawn, and the pose (3,) that it is drawn at [m, m, rad]."""
 TILE = 64
 """Finest cells along a tile's side."""
 _EPOCHS = -1
@@ -125,34 +128,30 @@ def _block(layer: int, row: int | np.integer, col: int | np.integer) -> tuple[sl
 
 
 def redraw(
-    config: Config,
-    params: Params,
-    tiles: Tiles,
-    seen: Iterable[tuple[np.ndarray, Snapshot]],
-    robot: np.ndarray,
-    epoch: float = 1.0,
+    config: Config, params: Params, tiles: Tiles, seen: Iterable[Posed], robot: np.ndarray, epoch: float = 1.0
 ) -> Grid:
-    """A fresh map of scans (pose (3,) [m, m, rad], snapshot), in their order; its window is over the robot (2,) [m] at
-    the end, what lies outside it in the tiles. epoch: of the ground, see grid [m]."""
+    """A fresh map of scans, in their order; its window is over the robot (2,) [m] at the end, what lies outside it in
+    the tiles. epoch: of the ground, see grid [m]."""
     tiles.clear()
     grid = tiles.recentre(occupancy.empty(config.cells, config.levels, config.resolution), robot)
-    for pose, snapshot in seen:
-        grid = draw_onto(config, params, tiles, grid, pose, snapshot, epoch)
+    grid = draw_onto(config, params, tiles, grid, seen, epoch)
     if tiles.needs_move(np.asarray(grid.origin, float), config.cells, robot):
         grid = tiles.recentre(grid, robot)
     return grid
 
 
-def draw_onto(
-    config: Config, params: Params, tiles: Tiles, grid: Grid, pose: np.ndarray, snapshot: Snapshot, epoch: float
-) -> Grid:
-    """The map with one more scan at a pose (3,) [m, m, rad]; the window follows it."""
-    if tiles.needs_move(np.asarray(grid.origin, float), config.cells, pose[:2]):
-        grid = tiles.recentre(grid, pose[:2])
-    return _draw(config, params, grid, np.float32(pose), snapshot, np.float32(epoch))
+def draw_onto(config: Config, params: Params, tiles: Tiles, grid: Grid, seen: Iterable[Posed], epoch: float) -> Grid:
+    """The map with more scans, in their order; the window follows them."""
+    for pose, snapshot in seen:
+        if tiles.needs_move(np.asarray(grid.origin, float), config.cells, pose[:2]):
+            grid = tiles.recentre(grid, pose[:2])
+        grid = _draw(config, params, grid, np.float32(pose), snapshot, np.float32(epoch))
+    return grid
 
 
 @partial(jax.jit, static_argnums=0, donate_argnums=2)
-def _draw(config: Config, params: Params, grid: Grid, pose, snapshot: Snapshot, epoch) -> Grid:
+def _draw(
+    config: Config, params: Params, grid: Grid, pose: Float[Array, "3"], snapshot: Snapshot, epoch: Float[Array, ""]
+) -> Grid:
     sweep = undo_motion(snapshot.scan, params.lidar, snapshot.drift, snapshot.yaw_rate)
-    return occupancy.integrate(grid, jnp.asarray(pose), sweep, config.resolution, epoch)
+    return occupancy.integrate(grid, pose, sweep, config.resolution, epoch)

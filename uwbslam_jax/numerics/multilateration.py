@@ -13,7 +13,9 @@ WALK_M_S = 1.0
 _APART_M = 0.5
 """Two places closer than this are one."""
 _AT_REST = 1e-6
+"""The same of a node at rest: none, but not singular [m/s]."""
 _MOVES = 12
+"""Gauss-Newton steps, of 2 m at most: enough for a place within a radio's reach."""
 _ENOUGH = 1e-3
 """A place is settled when a move gains less log-likelihood than this."""
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 _LEAST = 64
+"""Rows of an empty array: a short run does not grow it often."""
 _GROWTH = 1.25
 """Less than twice: what a run of hours keeps is copied a few times more often, but little room stands empty."""
 

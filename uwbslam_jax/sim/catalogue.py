@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
@@ -80,40 +80,45 @@ def _directed(world: World, seed: int) -> World:
     return replace(world, lap=np.roll(lap, stream(seed, "direction").integers(len(lap)), axis=0))
 
 
-def _laps(
-    world: World,
-    seed: int,
-    duration: float,
-    ids: Sequence[int],
-    speed: float = 0.8,
-    radius: float = 1.2,
-    height: float = 0.0,
-    sway: float = 0.0,
-    rest: float = 4.0,
-) -> Scenario:
-    """Rest for a while [s], then laps to the end; sway: the driver wanders this far to either side [m]."""
-    track = Track(world.lap, radius, closed=True)
-    if sway > 0.0:
-        track = track.swayed(sway, stream(seed, "sway"))
-    path = Path([Rest(rest), Along(track, 0.0, speed * max(duration - rest, 1.0), speed)])
+class _Drive(NamedTuple):
+    """How laps are driven: after a rest, in arcs of a radius; the driver wanders as far as `sway` to either side."""
+
+    speed: float = 0.8  # m/s
+    radius: float = 1.2  # m
+    sway: float = 0.0  # m
+    rest: float = 4.0  # s
+
+
+def _laps(world: World, seed: int, duration: float, ids: Sequence[int], drive: _Drive, height: float = 0.0) -> Scenario:
+    """Rest for a while, then laps to the end."""
+    track = Track(world.lap, drive.radius, closed=True)
+    if drive.sway > 0.0:
+        track = track.swayed(drive.sway, stream(seed, "sway"))
+    path = Path([Rest(drive.rest), Along(track, 0.0, drive.speed * max(duration - drive.rest, 1.0), drive.speed)])
     return Scenario("laps", seed, duration, world, path, _beacons(world, track, seed, ids, height))
 
 
 def _workshop(seed: int, duration: float | None) -> Scenario:
     world = _directed(worlds.workshop(seed), seed)
-    made = _laps(world, seed, duration or 150.0, (1, 2, 3, 4, 5))
+    made = _laps(world, seed, duration or 150.0, (1, 2, 3, 4, 5), _Drive())
     track = Track(world.lap, 1.2, closed=True)
     if duration is None:  # three laps, then a rest
         made = replace(made, path=Path([Rest(4.0), Along(track, 0.0, 3.0 * track.length)]))
     return made
 
 
-def _hall(seed: int, duration: float | None, ids: Sequence[int] = (7, 3, 12, 5, 9), **options: Any) -> Scenario:
+def _hall(
+    seed: int,
+    duration: float | None,
+    ids: Sequence[int] = (7, 3, 12, 5, 9),
+    height: float = 0.0,
+    **drive: float,
+) -> Scenario:
     world = _directed(worlds.hall(seed), seed)
     ids = [int(i) for i in stream(seed, "ids").permutation(ids)]
     driver = stream(seed, "driver")
-    options = {"speed": driver.uniform(0.6, 1.0), "rest": driver.uniform(0.5, 6.0), "sway": 0.15, **options}
-    return _laps(world, seed, duration or 150.0, ids, **options)
+    drive = {"speed": driver.uniform(0.6, 1.0), "rest": driver.uniform(0.5, 6.0), "sway": 0.15, **drive}
+    return _laps(world, seed, duration or 150.0, ids, _Drive(**drive), height)
 
 
 def _hall40(seed: int, duration: float | None) -> Scenario:
@@ -214,7 +219,7 @@ def _straight(seed: int, duration: float | None) -> Scenario:
     lap = np.roll(lap, 2, axis=0)  # the edge before the first waypoint is a long one
     track = Track(lap, 1.2, closed=True)
     track = Track(lap, 1.2, closed=True, lead=0.5 * float(np.hypot(*(lap[0] - lap[-1]))) - track.first_turn + 12.0)
-    made = _laps(world, seed, duration or 150.0, (4, 2, 8, 6, 1))
+    made = _laps(world, seed, duration or 150.0, (4, 2, 8, 6, 1), _Drive())
     return replace(made, path=Path([Rest(4.0), Along(track, 0.0, 0.8 * max(made.duration - 4.0, 1.0))]))
 
 

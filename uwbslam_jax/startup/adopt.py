@@ -41,7 +41,7 @@ def adopt(
     cov = J @ cov @ J.T
     motion = frame_motion(placement.beacons, placement.slots, frame_slots)
     after = compose(motion, placement.poses)
-    belief = anchored(state.belief, config.nodes, y(x), cov, placement.slots, pose)
+    belief = anchored(state.belief, y(x), cov, placement.slots)
     active = jnp.zeros(config.nodes, bool).at[jnp.array([0, *placement.slots])].set(True)
     seen = [(pose, key.snapshot()) for pose, key in zip(after, keys, strict=True) if bool(key.frame.frame.has_scan)]
     grid = redraw(config, view.params, tiles, seen, y(x)[:2])

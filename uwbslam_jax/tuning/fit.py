@@ -13,12 +13,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+from jaxtyping import Array, Float
 
 from uwbslam_jax.tuning import parameters
 from uwbslam_jax.tuning.likelihood import Objective, Score
 
 Progress = Callable[[str], object]
 _MOST_STEPS = 40
+"""Of BFGS; a fit that has not converged by then says so."""
 _TOLERANCE = 1e-3
 """The fit ends when a step is shorter than this in the logarithms and tells less than this a measurement,"""
 _STANDSTILL = 0.5
@@ -39,6 +41,7 @@ _OBSERVED = 0.5
 _TOLD = 2.0
 """Log-likelihood by which a value has to be worse to be ruled out (95 %)."""
 _BISECTIONS = 6
+"""A bound is found to 1/64 of the way between its two ends."""
 
 
 @dataclass(frozen=True)
@@ -125,23 +128,25 @@ def _scanned(objective: Objective) -> np.ndarray:
     return logs
 
 
-def _descend(objective: Objective, start: np.ndarray, history, progress: Progress) -> tuple[np.ndarray, str]:
+def _descend(
+    objective: Objective, start: np.ndarray, history: list[tuple[float, float]], progress: Progress
+) -> tuple[np.ndarray, str]:
     """BFGS until it converges, or the held-out part gets worse and worse."""
     if not objective.free.any():
         return start, "nothing is observed"
 
     @jax.custom_vjp
-    def loss(logs):
+    def loss(logs: Float[Array, "p"]) -> Float[Array, ""]:
         return jnp.float32(objective.value(np.asarray(logs, float)))
 
-    def forward(logs):
+    def forward(logs: Float[Array, "p"]) -> tuple[Float[Array, ""], Float[Array, "p"]]:
         value, gradient = objective.value_and_gradient(np.asarray(logs, float))
         return jnp.float32(value), jnp.asarray(gradient, jnp.float32)
 
     loss.defvjp(forward, lambda gradient, cotangent: (cotangent * gradient,))
     solver = optx.BFGS(rtol=_TOLERANCE, atol=_TOLERANCE)
 
-    def fn(logs, _):
+    def fn(logs: Float[Array, "p"], _: None) -> tuple[Float[Array, ""], None]:
         return loss(logs), None
 
     y = jnp.asarray(start, jnp.float32)

@@ -26,6 +26,7 @@ Goal = Literal["likelihood", "truth"]
 HELD_SHARE = 0.25
 """Last part of a rollout that takes no part in the fit."""
 _FLAT_M2 = 1e-12
+"""Keeps the logarithm of a mean square error finite where the track is exact [m^2]."""
 _WORST = 1e3
 """Loss of parameters with which the estimator breaks down, a measurement."""
 
@@ -117,7 +118,7 @@ class Objective:
             frames = jax.tree.map(lambda x, n=p.count: x[:n], r.frames)
             true = jnp.asarray(p.true[: p.count], jnp.float32)
             x = jnp.asarray(logs, jnp.float32)
-            one, slope = _value_and_gradient(r.config, self.names, self.goal, x, r.params, r.state, frames, true)
+            one, slope = _value_and_gradient(r.config, self.names, self.goal, x, (r.params, r.state), (frames, true))
             total, gradient = total + float(one), gradient + np.asarray(slope, float)
         if not (np.isfinite(total) and np.isfinite(gradient).all()):
             return _WORST, np.zeros(len(logs))
@@ -157,7 +158,7 @@ def _square_error(found: Float[Array, "T 2"], true: Float[Array, "T 2"]) -> Floa
     known = jnp.all(jnp.isfinite(true), axis=1)[:, None]
     count = jnp.maximum(jnp.sum(known), 1)
 
-    def centred(points):
+    def centred(points: Float[Array, "T 2"]) -> Float[Array, "T 2"]:
         points = jnp.where(known, points, 0.0)
         return jnp.where(known, points - jnp.sum(points, axis=0, keepdims=True) / count, 0.0)
 
@@ -174,14 +175,26 @@ def _rms(found: np.ndarray, true: np.ndarray) -> float:
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _losses(config: Config, names: tuple[str, ...], logs, params: Params, state: State, frames: Frame) -> Losses:
+def _losses(
+    config: Config, names: tuple[str, ...], logs: Float[Array, "p"], params: Params, state: State, frames: Frame
+) -> Losses:
     tuned = parameters.put(params, names, logs)
     return losses(config, tuned, rescaled(tuned, params, state), frames)
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
-def _value_and_gradient(config: Config, names, goal: Goal, logs, params, state, frames, true):
-    def total(logs):
+def _value_and_gradient(
+    config: Config,
+    names: tuple[str, ...],
+    goal: Goal,
+    logs: Float[Array, "p"],
+    start: tuple[Params, State],
+    data: tuple[Frame, Float[Array, "T 2"]],
+) -> tuple[Float[Array, ""], Float[Array, "p"]]:
+    """Of a rollout from its start, with the truth of its frames."""
+    (params, state), (frames, true) = start, data
+
+    def total(logs: Float[Array, "p"]) -> Float[Array, ""]:
         tuned = parameters.put(params, names, logs)
         return _total(checkpointed(config, tuned, rescaled(tuned, params, state), frames), true, goal)
 

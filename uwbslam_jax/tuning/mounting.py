@@ -14,6 +14,7 @@ from uwbslam_jax.settings import HostParams
 _SCALE = 0.1
 """Spread of the wheels' scale errors, of way and turn."""
 _HELD = 1e-4
+"""Spread of the first pose, which holds the frame [m, m, rad]."""
 FIXED = 1e-6
 """Spread of what is not asked for."""
 _STAGES = ((1000.0, 4.0), (30.0, 2.0), (5.0, 1.0), (5.0, 1.0))
@@ -24,7 +25,9 @@ _WHEELS = (0.02, 0.02)
 _WAY, _TURN = 0.01, 0.02
 """Way and turn that a step counts at least [m, rad]."""
 _MOVES, _ENOUGH = 20, 0.02
+"""Steps of a stage at most; one that gains less log-likelihood is the last."""
 _H = 1e-6
+"""Of central differences: with float64 they are good to 1e-10."""
 
 Array = np.ndarray
 

@@ -33,6 +33,7 @@ _MARGIN_M = 6.4
 _BORDER_M = 0.5
 """Of a window around what is seen [m]."""
 _EVERY_BEAM = 20
+"""Every so many beams tell how far a scan sees."""
 FEWEST_FRAMES = 60
 """A shorter rollout tells nothing."""
 
@@ -157,7 +158,7 @@ def cropped(grid: Grid, resolution: float, origin: np.ndarray, cells: int) -> Gr
     """The part of a window that another one sees, whose corner is at origin (2,) [m], a whole number of tiles away."""
     shift = np.round((np.asarray(grid.origin, float) - origin) / resolution).astype(int)
 
-    def part(layer, level: int):
+    def part(layer: Float[Array, "_ _"], level: int) -> Float[Array, "_ _"]:
         old, new = np.asarray(layer), np.zeros((cells >> level, cells >> level), np.float32)
         n, (col, row) = len(old), shift >> level
         rows, cols = (slice(max(s, 0), min(s + n, len(new))) for s in (row, col))

@@ -120,7 +120,7 @@ def _servers(options: EmulateOptions, made: Scenario, departure: Departure, faul
             raise DriverError(f"no emulated device {name}{hint}")
         # An odd uptime each: nothing may depend on devices that were switched on just now, or together.
         device = EMULATORS[name](DeviceTime(host_time(), 1_234_567_890 * (number + 1), options.drift))
-        yield Server(device, _plug(name, url), made, departure, faults, drift=options.drift, number=number)
+        yield Server(device, _plug(name, url), made, departure, faults, number)
 
 
 def _plug(name: str, url: str) -> Plug:

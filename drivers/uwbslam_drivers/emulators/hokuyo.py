@@ -61,9 +61,9 @@ class EmulatedHokuyo:
         for due, scan in robot.scans(scenario, lidar):
             yield due + PROCESSING, scan
 
-    def restart(self, time: DeviceTime) -> None:
+    def restart(self, boot: int) -> None:
         """Loses its power and comes back: nothing measured, the clock anew."""
-        self.__init__(time, self.spec)
+        self.__init__(replace(self.time, boot=boot, shows=0), self.spec)
 
     def encode(self, scan: ScanMessage, departure: int) -> bytes:
         """The reply with a scan, b"" while none is asked for; the robot set off at a host time [ns]."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 from uwbslam_drivers import dwm1000, linktrack
@@ -24,9 +25,9 @@ class Radio:
     def __init__(self, time: DeviceTime):
         self.time = time
 
-    def restart(self, time: DeviceTime) -> None:
+    def restart(self, boot: int) -> None:
         """Loses its power and comes back."""
-        self.__init__(time)
+        self.__init__(replace(self.time, boot=boot, shows=0))
 
     def measurements(self, scenario: Scenario) -> Iterator[tuple[int, Any]]:
         """Rounds of the robot's own exchanges."""

@@ -36,8 +36,8 @@ class EmulatedRplidar:
         self._heard = b""
         self._begun = False
 
-    def restart(self, time: DeviceTime) -> None:
-        self.__init__(time)
+    def restart(self, boot: int) -> None:
+        self.__init__(DeviceTime(boot))
 
     def measurements(self, scenario: Scenario) -> Iterator[tuple[int, Samples]]:
         """Samples, 32 at a time."""

@@ -47,8 +47,8 @@ class EmulatedDevice(Protocol):
         """What it says at once to bytes that it hears."""
         ...
 
-    def restart(self, time: DeviceTime) -> None:
-        """Forgets everything, as after a loss of power."""
+    def restart(self, boot: int) -> None:
+        """Forgets everything, as after a loss of power, and is switched on at a host time [ns]."""
         ...
 
 
@@ -75,16 +75,13 @@ class Server:
         scenario: Scenario,
         departure: Departure,
         faults: Faults | None = None,
-        *,
-        drift: float = 0.0,
         number: int = 0,
     ):
-        """drift: of the device's clock [1e-6]. number: of this device; it shifts its pauses and pulled plugs."""
+        """number: of this device; it shifts its pauses and pulled plugs."""
         self._device, self._plug, self._departure = device, plug, departure
         self._faults = faults or Faults()
         self._phase = number * 0.37 % 1.0
         self._line = Line(self._faults, stream(scenario.seed, f"line {number}"), self._phase)
-        self._drift = drift
         self._measurements = device.measurements(scenario)
         self._next = next(self._measurements, None)  # made before anybody waits for it
         self._stop = threading.Event()
@@ -148,7 +145,7 @@ class Server:
         if pulled and not self._pulled:
             self._plug.pull()
             self._line.clear()
-            self._device.restart(DeviceTime(now, 0, self._drift))
+            self._device.restart(now)
         elif self._pulled and not pulled:
             self._plug.restore()
         self._pulled = pulled
