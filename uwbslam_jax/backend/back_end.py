@@ -1,4 +1,4 @@
-"""The back end as a part of the host: collects every frame, solves the run so far beside it, hands over what is news."""
+"""The back end as a part of the host: collects every frame, solves the run so far beside it, gives what is news."""
 
 from __future__ import annotations
 
