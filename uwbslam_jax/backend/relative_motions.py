@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from uwbslam_jax.backend.graph import Graph
-from uwbslam_jax.numerics import between, turned, wrapped
+from uwbslam_jax.numerics import Edges, between, turned, wrapped
 
 _LOOSE_WHEELS = (0.03, 0.06, 0.02, 0.06)
 """Standard deviation of a step by wheels: floor and share of the way [m], floor and share of the turn [rad]."""
@@ -26,22 +24,7 @@ _FEWEST_STEPS = 20
 """So many steps tell how evenly a robot drives."""
 
 
-class Steps(NamedTuple):
-    """Keyframes relative to older ones, E of them.
-
-    Attributes:
-      old, new: (E,) numbers of the keyframes. between: (E, 3) pose of the new one in the frame of the old one.
-      roots: (E, 3, 3) of their information, of which each is root.T @ root. soft: (E,) whether one may be wrong.
-    """
-
-    old: np.ndarray
-    new: np.ndarray
-    between: np.ndarray
-    roots: np.ndarray
-    soft: np.ndarray
-
-
-def steps(graph: Graph, poses: np.ndarray) -> Steps:
+def steps(graph: Graph, poses: np.ndarray) -> Edges:
     """Steps between consecutive keyframes, which bound what nothing measured, then the scans laid over older ones.
 
     Args:
@@ -64,7 +47,7 @@ def steps(graph: Graph, poses: np.ndarray) -> Steps:
         _diagonal(1 / _sigma(sure, _MATCHED)),
         np.sqrt(np.maximum(values, 0.0))[:, :, None] * vectors.swapaxes(1, 2),
     ]
-    return Steps(
+    return Edges(
         np.concatenate([new - 1, new[tight] - 1, edges["old"]]),
         np.concatenate([new, new[tight], edges["new"]]),
         np.concatenate([z, sure, edges["between"]]),

@@ -15,6 +15,13 @@ from uwbslam_jax.numerics.multilateration import (
     multilaterate as multilaterate,
     settle as settle,
 )
+from uwbslam_jax.numerics.pose_graph import (
+    Edges as Edges,
+    Pairs as Pairs,
+    PoseGraph as PoseGraph,
+    Stage as Stage,
+    TrackRanges as TrackRanges,
+)
 from uwbslam_jax.numerics.robust import (
     CALIBRATED_M as CALIBRATED_M,
     DECIDED as DECIDED,
@@ -47,8 +54,7 @@ from uwbslam_jax.numerics.se2_host import (
 )
 from uwbslam_jax.numerics.sparse_least_squares import (
     Sink as Sink,
-    blocks as blocks,
+    cost_of as cost_of,
     covariance as covariance,
-    elimination as elimination,
     minimise as minimise,
 )
