@@ -22,7 +22,8 @@ from uwbslam_jax.numerics import (
     Stage,
     TrackRanges,
     covariance,
-    mean_sigma,
+    median_range,
+    widened,
 )
 from uwbslam_jax.settings import HostParams
 
@@ -108,20 +109,15 @@ class Problem(PoseGraph):
         to = number[which]
         means, to = means[to >= 0], to[to >= 0]
         slot, loud = means["slot"], means["loud"]
-        # a wall makes all of its ranges too long: many of them tell no more than one
-        walled = np.bincount(to[loud], minlength=len(nodes))
-        sigma = means["sigma"] * np.where(loud, np.sqrt(np.maximum(walled[to], 1)), 1.0)
+        sigma = widened(means["sigma"], loud, to)
         pairs = []
         for (a, b), kept in graph.ranges.pairs.items():
             if a in index and b in index and len(kept) >= 3:
-                values = np.array(kept)
-                middle = float(np.median(values))
-                scatter = float(np.median(np.abs(values - middle))) / 0.674
-                s = mean_sigma(0.64 * len(values), scatter, host.sigma_n)
-                pairs.append((index[a], index[b], host.slant(middle, a[0], b[0]), host.rise(a[0], b[0]), s))
+                middle, spread, _ = median_range(np.array(kept), host.sigma_n)
+                pairs.append((index[a], index[b], host.slant(middle, a[0], b[0]), host.rise(a[0], b[0]), spread))
         distance, rise = host.slant(means["distance"].astype(float), 0, slot), host.rise(0, slot)
         share, before, after = (means[name].astype(float) for name in ("share", "before", "after"))
-        ranges = TrackRanges(means["at"], means["at"] + 1, to, share, (before, after), distance, rise, sigma)
+        ranges = TrackRanges(means["at"], means["at"] + 1, to, share, before, after, distance, rise, sigma)
         return Problem(
             count=len(graph.keyframes),
             bias_of=np.array([slots.index(slot) for slot, _ in nodes]),

@@ -40,7 +40,7 @@ class TrackRanges(NamedTuple):
 
     Attributes:
       at, after: (R,) pose before and after. to: (R,) place. share: (R,) of the way from the one pose to the other.
-      levers: (R, 2) twice, the antenna in the frames of both poses [m].
+      lever_at, lever_after: (R, 2) the antenna in the frames of both poses [m].
       distance, rise, sigma: (R,) range, difference of the heights, standard deviation [m].
     """
 
@@ -48,14 +48,15 @@ class TrackRanges(NamedTuple):
     after: np.ndarray
     to: np.ndarray
     share: np.ndarray
-    levers: tuple[np.ndarray, np.ndarray]
+    lever_at: np.ndarray
+    lever_after: np.ndarray
     distance: np.ndarray
     rise: np.ndarray
     sigma: np.ndarray
 
     def ends(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(R, 2) twice: where the antenna was as either pose alone has it [m]."""
-        return transformed(poses[self.at], self.levers[0]), transformed(poses[self.after], self.levers[1])
+        return transformed(poses[self.at], self.lever_at), transformed(poses[self.after], self.lever_after)
 
     def antenna(self, poses: np.ndarray) -> np.ndarray:
         """(R, 2) where the antenna was when each range was taken, between its two poses [m]."""
@@ -64,8 +65,7 @@ class TrackRanges(NamedTuple):
 
     def some(self, which: np.ndarray | slice) -> TrackRanges:
         """Those that are asked for."""
-        levers = (self.levers[0][which], self.levers[1][which])
-        return TrackRanges(*(levers if part is self.levers else part[which] for part in self))
+        return TrackRanges(*(column[which] for column in self))
 
 
 class Pairs(NamedTuple):

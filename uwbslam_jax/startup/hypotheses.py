@@ -12,7 +12,7 @@ from itertools import pairwise, product
 
 import numpy as np
 
-from uwbslam_jax.numerics import multilaterate, rotation_matrix, soften, turned
+from uwbslam_jax.numerics import multilaterate, rotation_matrix, scaled, soften, turned
 from uwbslam_jax.startup.placement import Placement, Problem
 
 _ANGLES = 72
@@ -128,19 +128,10 @@ def laid_on_track(problem: Problem) -> list[tuple[np.ndarray, np.ndarray]]:
 def _relative_geometry(problem: Problem) -> np.ndarray | None:
     """(B, 2) positions of the beacons from the ranges between them: classical scaling, then least squares."""
     count = len(problem.slots)
-    if count < 3 or len(problem.pairs.ends) < 2 * count - 3:
-        return None
-    distance = np.full((count, count), np.inf)
-    np.fill_diagonal(distance, 0.0)
     i, j = problem.pairs.ends.T
-    distance[i, j] = distance[j, i] = problem.pairs.distance
-    for k in range(count):  # what is not heard is bounded by a way round
-        distance = np.minimum(distance, distance[:, k, None] + distance[None, k, :])
-    if not np.isfinite(distance).all():
+    if count < 3 or len(i) < 2 * count - 3 or len(np.union1d(i, j)) < count:
         return None
-    centre = np.eye(count) - 1.0 / count
-    values, vectors = np.linalg.eigh(-0.5 * centre @ distance**2 @ centre)
-    spots = vectors[:, -2:] * np.sqrt(np.maximum(values[-2:], 0.0))
+    spots = scaled(count, i, j, problem.pairs.distance)
     for _ in range(10):
         u = spots[i] - spots[j]
         d = np.maximum(np.linalg.norm(u, axis=1), 1e-6)

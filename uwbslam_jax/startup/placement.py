@@ -6,7 +6,6 @@ Chains of poses with millimetre steps are beyond float32, and the problem runs o
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
@@ -22,15 +21,27 @@ from uwbslam_jax.numerics import (
     cost_of,
     covariance,
     largest_sigma,
+    median_range,
     multilaterate,
     rotation_matrix,
+    wrapped,
 )
 from uwbslam_jax.startup.keyframe_buffer import Buffer, Keyframe
 
+_LOOSE_WHEELS = (0.03, 0.06, 0.02, 0.06)
+"""Standard deviation of a step by wheels, see `step_sigma`."""
+_LOOSE = (0.1, 0.2, 0.05, 0.1)
+"""The same of a step that nothing measured, without what it may have driven in the time."""
+_LONGEST_S = 3.0
+"""So long at most counts with a metre a second."""
+_DRIFT = (0.005, 0.01, 0.002, 0.003)
+"""The same of what the map that a scan is matched with drifts on the step."""
 _MOST_MOVES = 20
 _STAGES = (Stage(soft=np.inf, coarse=8.0), Stage(soft=np.inf, coarse=1.0))
 """The problem is solved twice: first a range may err by so many times as much, or where the start is wrong by more than
 the radio errs all its ranges were outliers, and a beacon could as well be anywhere."""
+_FEWEST_MEANS = 3
+"""A beacon ranged less takes no part: so many averages over half an interval between keyframes."""
 _ENOUGH = 0.02
 """The batch problem is solved when a move gains less log-likelihood than this."""
 
@@ -85,28 +96,27 @@ class Problem(PoseGraph):
     track: np.ndarray
 
     @staticmethod
-    def build(buffer: Buffer) -> Problem:
-        """Arrays of what was buffered; only beacons ranged from at least three intervals take part."""
+    def build(buffer: Buffer) -> Problem | None:
+        """Arrays of what was buffered, with the beacons ranged often enough; None where these are not two."""
         keys = buffer.track()
-        seen = buffer.averages(keys)
-        slots = [int(s) for s, count in zip(*np.unique(seen.to, return_counts=True), strict=True) if count >= 3]
-        index = {slot: b for b, slot in enumerate(slots)}
-        ok = np.isin(seen.to, slots)
+        seen = [means for means in buffer.averages(keys) if len(means.at) >= _FEWEST_MEANS]
+        index = {int(means.to[0]): b for b, means in enumerate(seen)}
+        if len(seen) < 2:
+            return None
+        seen = [means._replace(to=np.full(len(means.at), b)) for b, means in enumerate(seen)]
         pairs = [
             (index[i], index[j], middle, 0.0, sigma)
-            for (i, j), (middle, sigma) in buffer.pair_medians().items()
+            for (i, j), kept in buffer.pairs.items()
             if i in index and j in index
+            for middle, sigma, _ in [median_range(np.array(kept), buffer.host.sigma_n)]
         ]
-        at, to = seen.at[ok], np.array([index[int(s)] for s in seen.to[ok]], int)
-        after, levers = np.minimum(at + 1, len(keys) - 1), (seen.before[ok], seen.after[ok])
-        distance, sigma = seen.distance[ok], seen.sigma[ok]
         return Problem(
             count=len(keys),
-            bias_of=1 + np.arange(len(slots)),
+            bias_of=1 + np.arange(len(index)),
             edges=_steps(keys),
-            ranges=TrackRanges(at, after, to, seen.share[ok], levers, distance, np.zeros(len(at)), sigma),
+            ranges=TrackRanges(*(np.concatenate(column) for column in zip(*seen, strict=True))),
             pairs=Pairs.of(pairs),
-            slots=slots,
+            slots=list(index),
             track=np.array([key.pose for key in keys]),
         )
 
@@ -161,21 +171,37 @@ class Problem(PoseGraph):
 
 def _steps(keys: list[Keyframe]) -> Edges:
     """Relative poses of consecutive keyframes, with the roots of their information in the earlier one's frame."""
-    new = np.arange(1, len(keys))
-    poses = np.array([key.pose for key in keys])
-    steps, roots = between(poses[:-1], poses[1:]), np.zeros((len(new), 3, 3))
-    for k, (a, b) in enumerate(pairwise(keys)):
-        turn = rotation_matrix(a.pose[2], 3).T
-        length, angle = np.hypot(*steps[k, :2]), abs(steps[k, 2])
-        elapsed = (b.frame.stamp - a.frame.stamp) / 1e9
-        # where the match says nothing, wheels or the motion model still bound the step; where it says much, the map
-        # it was matched with has its own drift
-        if b.odometry:
-            loose = np.diag([0.03 + 0.06 * length, 0.03 + 0.06 * length, 0.02 + 0.06 * angle]) ** 2
-        else:
-            pace = 0.1 + 0.2 * length + min(elapsed, 3.0)
-            loose = np.diag([pace, pace, 0.05 + 0.1 * angle]) ** 2
-        tight = np.diag([0.005 + 0.01 * length, 0.005 + 0.01 * length, 0.002 + 0.003 * angle]) ** 2
-        cov = np.linalg.inv(turn @ b.information @ turn.T + np.linalg.inv(loose)) + tight
-        roots[k] = np.linalg.cholesky(np.linalg.inv(cov)).T
+    new, poses = np.arange(1, len(keys)), np.array([key.pose for key in keys])
+    steps = between(poses[:-1], poses[1:])
+    elapsed = np.diff([key.frame.stamp for key in keys]) / 1e9
+    # where the match says nothing, wheels or the motion model still bound the step; where it says much, the map it was
+    # matched with has its own drift
+    loose = loose_sigma(steps, elapsed, np.array([key.odometry for key in keys[1:]]))
+    turn = np.array([rotation_matrix(-pose[2], 3) for pose in poses[:-1]])
+    told = turn @ np.array([key.information for key in keys[1:]]) @ turn.swapaxes(1, 2)
+    cov = np.linalg.inv(told + diagonal(loose**-2)) + diagonal(step_sigma(steps, _DRIFT) ** 2)
+    roots = np.linalg.cholesky(np.linalg.inv(cov)).swapaxes(1, 2)
     return Edges(new - 1, new, steps, roots, np.zeros(len(new), bool))
+
+
+def loose_sigma(steps: np.ndarray, elapsed: np.ndarray, rolled: np.ndarray) -> np.ndarray:
+    """(n, 3) standard deviation of steps (n, 3) between keyframes by wheels, where these measured them (n,), or by
+    nothing, where the robot may have driven for the time that elapsed (n,) [s]."""
+    driven = np.minimum(elapsed, _LONGEST_S)[:, None] * np.array([1.0, 1.0, 0.0])
+    return np.where(rolled[:, None], step_sigma(steps, _LOOSE_WHEELS), step_sigma(steps, _LOOSE) + driven)
+
+
+def step_sigma(steps: np.ndarray, loose: tuple[float, float, float, float]) -> np.ndarray:
+    """(n, 3) standard deviation of steps by their lengths and turns [m, m, rad].
+
+    Args:
+      loose: floor and share of the way [m], floor and share of the turn [rad].
+    """
+    floor, share, floor_yaw, share_yaw = loose
+    along = floor + share * np.hypot(steps[:, 0], steps[:, 1])
+    return np.stack([along, along, floor_yaw + share_yaw * np.abs(wrapped(steps[:, 2]))], axis=-1)
+
+
+def diagonal(values: np.ndarray) -> np.ndarray:
+    """Diagonal matrices (n, 3, 3) of rows (n, 3)."""
+    return values[:, :, None] * np.eye(3)

@@ -184,8 +184,8 @@ class Mounting:
             shift = compose(back, np.append(self.host.antenna, 0.0))[:, :2] - self.host.antenna
             ends = []
             for pose, lever, angle in (
-                (v[:, :3], p.levers[0], p.share * turn),
-                (v[:, 3:6], p.levers[1], (p.share - 1) * turn),
+                (v[:, :3], p.lever_at, p.share * turn),
+                (v[:, 3:6], p.lever_after, (p.share - 1) * turn),
             ):
                 moved = lever + turned(angle, shift)
                 ends.append(transformed(pose, transformed(change, moved)))
