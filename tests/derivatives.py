@@ -95,3 +95,23 @@ def assert_reverse(both, at: Any, *rest: Any, rtol: float, atol: float, count: i
 def along(gradient: Any, direction: Any) -> float:
     """Derivative along a direction."""
     return sum(jax.tree.leaves(jax.tree.map(lambda g, d: float(jnp.sum(g * d)), gradient, direction)))
+
+
+class Stack:
+    """A sink that keeps the rows: a dense Jacobian and the residuals."""
+
+    def __init__(self, unknowns: int):
+        self.unknowns, self.rows = unknowns, []
+
+    def add(self, residual, parts) -> None:
+        J = np.zeros((len(residual), self.unknowns))
+        for column, value in parts:
+            J[np.arange(len(residual)), column] += value
+        self.rows.append((J, residual))
+
+
+def stacked(fill, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    sink = Stack(len(x))
+    fill(x, sink)
+    J, r = (np.concatenate(part) for part in zip(*sink.rows, strict=True))
+    return J, r

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from derivatives import stacked
 from loop_graph import BEACONS, host, loop, make, solved, turned
 
 from uwbslam_jax.backend import smoothing
 from uwbslam_jax.backend.graph import Graph
-from uwbslam_jax.numerics import sparse_least_squares
+from uwbslam_jax.numerics import Stage, sparse_least_squares
 from uwbslam_jax.numerics.se2_host import between
 
 
@@ -122,34 +123,14 @@ def test_derivatives_agree_with_differences() -> None:
     rng = np.random.default_rng(3)
     x = problem.start(graph.poses() + rng.normal(0, 0.05, truth.shape), places)
     x[-5:] += rng.normal(0, 0.05, 5)
-    stage, sigmas = (1e6, 1.0), 0.3  # edges not softened: their reweighting is no derivative of the residual
-    fill = problem._rows(x[:3].copy(), sigmas, stage)
+    stage, sigmas = Stage(1e6, 1.0), 0.3  # edges not softened: their reweighting is no derivative of the residual
+    fill = problem.rows(x[:3].copy(), sigmas, stage)
     J, _ = stacked(fill, x)
     h = 1e-6
     for column in rng.choice(len(x), 40, replace=False):
         e = h * np.eye(len(x))[column]
         want = (stacked(fill, x + e)[1] - stacked(fill, x - e)[1]) / (2 * h)
         np.testing.assert_allclose(J[:, column], want, rtol=1e-4, atol=1e-4 * max(1, abs(want).max()))
-
-
-class Stack:
-    """A sink that keeps the rows: a dense Jacobian and the residuals."""
-
-    def __init__(self, unknowns: int):
-        self.unknowns, self.rows = unknowns, []
-
-    def add(self, residual, parts) -> None:
-        J = np.zeros((len(residual), self.unknowns))
-        for column, value in parts:
-            J[np.arange(len(residual)), column] += value
-        self.rows.append((J, residual))
-
-
-def stacked(fill, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    sink = Stack(len(x))
-    fill(x, sink)
-    J, r = (np.concatenate(part) for part in zip(*sink.rows, strict=True))
-    return J, r
 
 
 def test_normal_equations_are_those_of_the_rows(monkeypatch) -> None:
@@ -160,7 +141,7 @@ def test_normal_equations_are_those_of_the_rows(monkeypatch) -> None:
     places = {(slot, 0): spot for slot, spot in BEACONS.items()}
     problem = smoothing.Problem.build(graph, graph.poses(), places, host())
     x = problem.start(graph.poses() + np.random.default_rng(5).normal(0, 0.05, truth.shape), places)
-    fill = problem._rows(x[:3] + 1e-5, 0.3, (30.0, 2.0))
+    fill = problem.rows(x[:3] + 1e-5, 0.3, Stage(30.0, 2.0))
     J, r = stacked(fill, x)
     rank = np.random.default_rng(6).permutation(len(x))
     rows, cost = sparse_least_squares.Rows(rank), sparse_least_squares.Cost()
@@ -183,7 +164,7 @@ def test_unknowns_are_eliminated_in_an_order_that_keeps_the_factor_sparse() -> N
 
     def entries(rank: np.ndarray) -> tuple[int, int]:
         rows = sparse_least_squares.Rows(rank)
-        problem._rows(np.zeros(3), 0.3, (30.0, 2.0))(problem.start(graph.poses(), places), rows)
+        problem.rows(np.zeros(3), 0.3, Stage(30.0, 2.0))(problem.start(graph.poses(), places), rows)
         A = rows.normal().A
         return A.nnz // 2, sparse_least_squares._factor(A.T).L.nnz
 

@@ -12,7 +12,7 @@ from start_of_run import BEACONS, IDS, SETTINGS
 
 from uwbslam_jax.estimator import init, state_vector
 from uwbslam_jax.mapping.tiled_map import Tiles
-from uwbslam_jax.numerics import se2, se2_host
+from uwbslam_jax.numerics import TrackRanges, median_range, se2, se2_host
 from uwbslam_jax.settings import make_config, make_host_params, make_params
 from uwbslam_jax.startup import adopt, decide
 
@@ -206,12 +206,13 @@ def test_a_long_start_is_thinned_without_losing_ranges():
     kept._thin()
     assert count / 2 <= len(kept.keyframes) <= count / 2 + 2
     assert kept.newest == last
-    averages = kept.averages(kept.keyframes)
+    averages = TrackRanges(*map(np.concatenate, zip(*kept.averages(kept.keyframes), strict=True)))
     # each range still stands where it was taken, half of them now half-way between two keyframes
     poses = np.array([key.pose for key in kept.keyframes])
-    from_before = poses[averages.at, :2] + se2_host.turned(poses[averages.at, 2], averages.before)
-    after = np.minimum(averages.at + 1, len(poses) - 1)
-    from_after = poses[after, :2] + se2_host.turned(poses[after, 2], averages.after)
+    from_before = poses[averages.at, :2] + se2_host.turned(poses[averages.at, 2], averages.lever_at)
+    after = averages.after
+    assert (after == np.minimum(averages.at + 1, len(poses) - 1)).all()
+    from_after = poses[after, :2] + se2_host.turned(poses[after, 2], averages.lever_after)
     np.testing.assert_allclose(from_before, from_after, atol=1e-9)
     assert set(np.round(averages.share, 6)) == {0.0, 0.5}
 
@@ -221,11 +222,10 @@ def test_scatter_tells_ranges_through_walls_from_quiet_ones():
     rng = np.random.default_rng(0)
     kept.sightings[2] = deque(s._replace(distance=s.distance + rng.exponential(0.8)) for s in kept.sightings[2])
     kept.pairs[1, 3] = deque(d + rng.exponential(0.8) for d in kept.pairs[1, 3])
-    averages = kept.averages(kept.keyframes)
-    loud = averages.to == 2
-    assert np.median(averages.sigma[loud]) > 4 * np.median(averages.sigma[~loud])
-    medians = kept.pair_medians()
-    assert medians[1, 3][1] > 4 * max(medians[1, 2][1], medians[2, 3][1])
+    sigma = {int(means.to[0]): means.sigma for means in kept.averages(kept.keyframes)}
+    assert np.median(sigma[2]) > 4 * np.median(np.concatenate([sigma[1], sigma[3]]))
+    of_median = {pair: median_range(np.array(d), SETTINGS.uwb.sigma_n)[1] for pair, d in kept.pairs.items()}
+    assert of_median[1, 3] > 4 * max(of_median[1, 2], of_median[2, 3])
     factor = np.exp(kept.scatter(4))
     assert factor[0, 2] > 4
     assert factor[1, 3] > 3

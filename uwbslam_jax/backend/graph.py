@@ -6,7 +6,6 @@ with the ground that was covered.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -20,12 +19,8 @@ from uwbslam_jax.estimator import Estimate, map_pose
 from uwbslam_jax.measurements import Scan, Snapshot, StampedFrame
 from uwbslam_jax.numerics import Column, between, rotation_matrix, transformed, turned, wrapped
 from uwbslam_jax.settings import HostParams
+from uwbslam_jax.startup import is_blind, is_far
 
-_MOVED = (0.25, 0.2)
-"""A keyframe every so much of way or turn [m, rad]."""
-_BLIND_S = 0.5
-_BLIND_M = 0.3
-"""A keyframe also after this time where the scan tells the position no better than this."""
 _FEWEST_RETURNS = 20
 """A scan of fewer returns tells nothing."""
 _ANCHOR_M = 2.0
@@ -119,7 +114,7 @@ class Graph:
 
     def blind(self) -> np.ndarray:
         """(N,) whether a keyframe's scan does not tell where it is in some direction."""
-        return _blind(self.keyframes["informed"])
+        return is_blind(self.keyframes["informed"])
 
     def rolled(self) -> np.ndarray:
         """(N,) whether wheels measured all the way from the keyframe before."""
@@ -182,14 +177,18 @@ class Graph:
         self.ranges.hear(frame, estimate, pose, host)
         self._roll(frame)
         informed = np.asarray(estimate.information, float)
-        if len(self.keyframes) and not self._far(pose, frame.stamp, informed):
-            return
-        if self._broken or not len(self.keyframes):
+        if not len(self.keyframes):
             self.ranges.drop()
         else:
             last = self.keyframes[-1]
             stamps = int(last["stamp"]), frame.stamp
-            self.ranges.close(len(self.keyframes) - 1, stamps, (last["pose"], pose), host.sigma_n)
+            far = is_far(pose, last["pose"], stamps[1] - stamps[0], lambda: bool(is_blind(informed)))
+            if self._broken:
+                self.ranges.drop()
+            elif far:
+                self.ranges.close(len(self.keyframes) - 1, stamps, (last["pose"], pose), host.sigma_n)
+            else:
+                return
         drift = turned(-pose[2], np.asarray(estimate.velocity, float))
         told = pose, informed, drift, estimate.yaw_rate, self._wheels, self._broken
         self.keyframes.append((frame.stamp, number, *told))
@@ -198,14 +197,6 @@ class Graph:
         if self.scans[-1] is not None:
             self._tie(host)
         self._thin()
-
-    def _far(self, pose: np.ndarray, stamp: int, informed: np.ndarray) -> bool:
-        last = self.keyframes[-1]
-        # plain numbers: asked for every frame
-        (x, y, yaw), (x0, y0, yaw0) = pose.tolist(), last["pose"].tolist()
-        turn = math.remainder(yaw - yaw0, 2 * math.pi)
-        late = stamp - int(last["stamp"]) > _BLIND_S * 1e9 and bool(_blind(informed[None])[0])
-        return self._broken or math.hypot(x - x0, y - y0) > _MOVED[0] or abs(turn) > _MOVED[1] or late
 
     def _roll(self, frame: StampedFrame) -> None:
         odometry = frame.frame.odometry
@@ -277,10 +268,6 @@ class Graph:
             if len(others) >= _SCANS_OF_A_PLACE and spare:
                 self.scans[spare[0]] = None
                 self._kept.remove(spare[0])
-
-
-def _blind(informed: np.ndarray) -> np.ndarray:
-    return np.linalg.eigvalsh(informed[..., :2, :2])[..., 0] < _BLIND_M**-2
 
 
 def _sees(frame: StampedFrame) -> bool:

@@ -14,13 +14,11 @@ import numpy as np
 
 from uwbslam_jax.estimator import Estimate
 from uwbslam_jax.measurements import StampedFrame
-from uwbslam_jax.numerics import Column, mean_sigma
+from uwbslam_jax.numerics import Column, mean_sigma, near_middle, scatter_along, turned
 from uwbslam_jax.settings import HostParams
 
-_WINDOW = 21
+_NEWEST = 21
 """So many ranges of a pair tell how much they scatter."""
-_WILD_M = 0.5
-"""A range this far from the median of its interval takes no part in the mean."""
 _MOST = 400
 """Newest ranges of a pair that are kept: of two beacons, or while the robot rests."""
 
@@ -107,17 +105,9 @@ class RangeMeans:
                 continue
             c, s = math.cos(yaw + age * turning), math.sin(yaw + age * turning)
             place = x + age * vx + c * ahead - s * left, y + age * vy + s * ahead + c * left
-            self._newest.setdefault(j, deque(maxlen=_WINDOW)).append(distance)
+            self._newest.setdefault(j, deque(maxlen=_NEWEST)).append(distance)
             heard = _Heard(frame.stamp + age * 1e9, *place, distance)
             self._open.setdefault(self.node(j), deque(maxlen=_MOST)).append(heard)
-
-    def _scatter(self, slot: int, sigma_n: float) -> float:
-        """Standard deviation of a pair's newest ranges by their second differences, see keyframes [m]."""
-        d = np.array(self._newest.get(slot, ()))
-        if len(d) < _WINDOW:
-            return sigma_n
-        # the median of |x| of a normal x is 0.674 sigma, and a second difference has 6 sigma^2
-        return float(np.median(np.abs(d[2:] - 2 * d[1:-1] + d[:-2])) / (0.674 * np.sqrt(6.0)))
 
     def close(self, at: int, stamps: tuple[int, int], poses: tuple[np.ndarray, np.ndarray], sigma_n: float) -> None:
         """Average what was heard on the way from one keyframe to the next.
@@ -127,7 +117,8 @@ class RangeMeans:
         """
         span = max(stamps[1] - stamps[0], 1)
         for node, heard in self._open.items():
-            scatter = self._scatter(node[0], sigma_n)
+            newest = np.array(self._newest.get(node[0], ()))
+            scatter = float(scatter_along(newest, sigma_n)[-1]) if len(newest) else sigma_n
             # two means in each interval: one would leave the keyframes free to move to and fro between their middles
             halves: dict[bool, list[_Heard]] = defaultdict(list)
             for one in heard:
@@ -145,16 +136,10 @@ def _mean(
     start: int, span: int, poses: tuple[np.ndarray, np.ndarray], noise: tuple[float, float], heard: list[_Heard]
 ) -> tuple:
     """The fields of MEAN from the share on. noise: scatter of the pair's ranges, and sigma_n [m]."""
-    middle = sorted(one.distance for one in heard)[len(heard) // 2]  # one of them, so at least one is near it
-    ok = [one for one in heard if abs(one.distance - middle) < _WILD_M]
-    stamp, *antenna, distance = (sum(column) / len(ok) for column in zip(*ok, strict=True))
+    rows = np.array(heard)
+    rows = rows[near_middle(rows[:, 3])]
+    stamp, x, y, distance = rows.mean(0).tolist()
     share = min(max((stamp - start) / span, 0.0), 1.0)
-    before, after = (_within(pose.tolist(), *antenna) for pose in poses)
-    sigma = mean_sigma(len(ok), *noise)
+    before, after = (turned(-pose[2], np.array([x, y]) - pose[:2]) for pose in poses)
+    sigma = mean_sigma(len(rows), *noise)
     return share, before, after, distance, sigma, sigma > mean_sigma(1, noise[1], noise[1])
-
-
-def _within(pose: list[float], x: float, y: float) -> tuple[float, float]:
-    """A place in the frame of a pose [m]."""
-    c, s, dx, dy = math.cos(pose[2]), math.sin(pose[2]), x - pose[0], y - pose[1]
-    return c * dx + s * dy, c * dy - s * dx

@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from uwbslam_jax.backend.graph import Graph
-from uwbslam_jax.numerics import between, turned, wrapped
+from uwbslam_jax.numerics import Edges, between, turned, wrapped
+from uwbslam_jax.startup import diagonal, loose_sigma, step_sigma
 
-_LOOSE_WHEELS = (0.03, 0.06, 0.02, 0.06)
-"""Standard deviation of a step by wheels: floor and share of the way [m], floor and share of the turn [rad]."""
-_LOOSE = (0.1, 0.2, 0.05, 0.1)
-"""The same of a step that nothing measured, without what it may have driven in the time."""
 _MATCHED = (0.02, 0.02, 0.01, 0.02)
-"""The same of a step between two scans that were matched with the map: less than two scans tell that can be laid over
-each other, but these may see nothing of the same, or be laid wrong."""
-_LONGEST_S = 3.0
-"""So long at most counts with a metre a second."""
+"""Standard deviation, see `step_sigma`, of a step between two scans that were matched with the map: less than two scans
+tell that can be laid over each other, but these may see nothing of the same, or be laid wrong."""
 _ASTRAY = (1.0, 0.3)
 """Farther off than this [m, rad] nothing is that two scans tell of a robot that is known by its ranges."""
 _UNSTEADY = (0.1, 1.0)
@@ -26,22 +19,7 @@ _FEWEST_STEPS = 20
 """So many steps tell how evenly a robot drives."""
 
 
-class Steps(NamedTuple):
-    """Keyframes relative to older ones, E of them.
-
-    Attributes:
-      old, new: (E,) numbers of the keyframes. between: (E, 3) pose of the new one in the frame of the old one.
-      roots: (E, 3, 3) of their information, of which each is root.T @ root. soft: (E,) whether one may be wrong.
-    """
-
-    old: np.ndarray
-    new: np.ndarray
-    between: np.ndarray
-    roots: np.ndarray
-    soft: np.ndarray
-
-
-def steps(graph: Graph, poses: np.ndarray) -> Steps:
+def steps(graph: Graph, poses: np.ndarray) -> Edges:
     """Steps between consecutive keyframes, which bound what nothing measured, then the scans laid over older ones.
 
     Args:
@@ -51,20 +29,19 @@ def steps(graph: Graph, poses: np.ndarray) -> Steps:
     keys = graph.keyframes.values
     new = np.flatnonzero(~keys["broken"][1:]) + 1
     stamp, matched = keys["stamp"] / 1e9, between(keys["pose"][new - 1], keys["pose"][new])
-    rolled = graph.rolled()[new, None]
-    z = np.where(rolled, keys["wheels"][new], matched)
-    elapsed = np.minimum(stamp[new] - stamp[new - 1], _LONGEST_S)[:, None] * np.array([1.0, 1.0, 0.0])
-    loose = np.where(rolled, _sigma(z, _LOOSE_WHEELS), _sigma(z, _LOOSE) + elapsed)
+    rolled = graph.rolled()[new]
+    z = np.where(rolled[:, None], keys["wheels"][new], matched)
+    loose = loose_sigma(z, stamp[new] - stamp[new - 1], rolled)
     sees = ~graph.blind()
     tight = sees[new - 1] & sees[new]
     sure, edges = matched[tight], _near(graph.edges.values, poses)
     values, vectors = np.linalg.eigh(edges["information"].astype(float))
     roots = [
-        _diagonal(1 / loose),
-        _diagonal(1 / _sigma(sure, _MATCHED)),
+        diagonal(1 / loose),
+        diagonal(1 / step_sigma(sure, _MATCHED)),
         np.sqrt(np.maximum(values, 0.0))[:, :, None] * vectors.swapaxes(1, 2),
     ]
-    return Steps(
+    return Edges(
         np.concatenate([new - 1, new[tight] - 1, edges["old"]]),
         np.concatenate([new, new[tight], edges["new"]]),
         np.concatenate([z, sure, edges["between"]]),
@@ -77,18 +54,6 @@ def _near(edges: np.ndarray, poses: np.ndarray) -> np.ndarray:
     """The edges that are not far from where the keyframes are."""
     off = between(poses[edges["old"]], poses[edges["new"]]) - edges["between"]
     return edges[(np.hypot(off[:, 0], off[:, 1]) <= _ASTRAY[0]) & (np.abs(wrapped(off[:, 2])) <= _ASTRAY[1])]
-
-
-def _diagonal(values: np.ndarray) -> np.ndarray:
-    """Diagonal matrices (n, 3, 3) of rows (n, 3)."""
-    return values[:, :, None] * np.eye(3)
-
-
-def _sigma(step: np.ndarray, loose: tuple[float, float, float, float]) -> np.ndarray:
-    """Standard deviation of steps (n, 3) by their lengths and turns [m, m, rad]."""
-    floor, share, floor_yaw, share_yaw = loose
-    along = floor + share * np.hypot(step[:, 0], step[:, 1])
-    return np.stack([along, along, floor_yaw + share_yaw * np.abs(wrapped(step[:, 2]))], axis=-1)
 
 
 def even_drive(graph: Graph) -> np.ndarray:

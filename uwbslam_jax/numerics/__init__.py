@@ -13,7 +13,15 @@ from uwbslam_jax.numerics.multilateration import (
     locate as locate,
     mirrored as mirrored,
     multilaterate as multilaterate,
+    scaled as scaled,
     settle as settle,
+)
+from uwbslam_jax.numerics.pose_graph import (
+    Edges as Edges,
+    Pairs as Pairs,
+    PoseGraph as PoseGraph,
+    Stage as Stage,
+    TrackRanges as TrackRanges,
 )
 from uwbslam_jax.numerics.robust import (
     CALIBRATED_M as CALIBRATED_M,
@@ -22,8 +30,12 @@ from uwbslam_jax.numerics.robust import (
     SIGMA_ENOUGH_M as SIGMA_ENOUGH_M,
     largest_sigma as largest_sigma,
     mean_sigma as mean_sigma,
+    median_range as median_range,
     misfit as misfit,
+    near_middle as near_middle,
+    scatter_along as scatter_along,
     soften as soften,
+    widened as widened,
 )
 from uwbslam_jax.numerics.row_buffer import Column as Column
 from uwbslam_jax.numerics.se2 import (
@@ -47,8 +59,7 @@ from uwbslam_jax.numerics.se2_host import (
 )
 from uwbslam_jax.numerics.sparse_least_squares import (
     Sink as Sink,
-    blocks as blocks,
+    cost_of as cost_of,
     covariance as covariance,
-    elimination as elimination,
     minimise as minimise,
 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse.csgraph import shortest_path
 
 from uwbslam_jax.numerics.robust import _SOFT, DECIDED, RANGE_FLOOR_M, SIGMA_ENOUGH_M, soften
 
@@ -165,6 +166,20 @@ def locate(anchors: np.ndarray, distance: np.ndarray, sigma: np.ndarray) -> tupl
     if np.median(np.abs(residual)) > 3 * np.median(sigma):
         return None  # no one place explains the ranges
     return spot.place, spot.cov[:2, :2] + RANGE_FLOOR_M**2 * np.eye(2)
+
+
+def scaled(count: int, i: np.ndarray, j: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """(count, 2) places from the distances (L,) between some of them, by classical multidimensional scaling [m].
+
+    Missing distances are the shortest way round (as in Isomap); between groups that nothing ties, the largest known.
+    """
+    known = np.full((count, count), np.inf)
+    known[i, j] = known[j, i] = distance
+    square = shortest_path(known, directed=False) ** 2
+    square[~np.isfinite(square)] = square[np.isfinite(square)].max()
+    centre = np.eye(count) - 1.0 / count
+    values, vectors = np.linalg.eigh(-0.5 * centre @ square @ centre)
+    return vectors[:, -2:] * np.sqrt(np.maximum(values[-2:], 1e-6))
 
 
 def _descend(starts, time, anchors, distance, sigma, walk: float) -> tuple[np.ndarray, np.ndarray]:

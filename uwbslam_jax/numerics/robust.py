@@ -12,6 +12,12 @@ CALIBRATED_M = 1e-3
 
 _SOFT = 4.0
 """Whitened residual at which a range's influence starts to fall (Geman-McClure)."""
+_WINDOW = 21
+"""So many ranges of a pair around one tell how much they scatter there."""
+_WILD_M = 0.5
+"""A range this far from the median of others at about the same time takes no part in their mean."""
+_FEWEST_OF_PAIR = 5
+"""So many ranges of a pair at rest tell how much they scatter."""
 RANGE_FLOOR_M = 0.02
 """However many ranges are averaged, their mean is not better than this."""
 DECIDED = 15.0
@@ -43,3 +49,40 @@ def mean_sigma(count: float, scatter: float, sigma_n: float) -> float:
     scatter does not average out."""
     excess = max(scatter**2 - (_QUIET * sigma_n) ** 2, 0.0)
     return float(np.sqrt(sigma_n**2 / max(count, 1.0) + RANGE_FLOOR_M**2 + excess))
+
+
+def widened(sigma: np.ndarray, loud: np.ndarray, which: np.ndarray) -> np.ndarray:
+    """Standard deviations (n,) of means, where those that are loud (n,) of one pair (n,) tell no more than one: a wall
+    makes all of its ranges too long."""
+    count = np.bincount(which[loud], minlength=int(which.max(initial=0)) + 1)[which]
+    return sigma * np.where(loud, np.sqrt(np.maximum(count, 1)), 1.0)
+
+
+def near_middle(ranges: np.ndarray) -> np.ndarray:
+    """(n,) which of some ranges to one place are near their median [m]."""
+    middle = np.sort(ranges)[len(ranges) // 2]  # one of them, so that at least one is near it
+    return np.abs(ranges - middle) < _WILD_M
+
+
+def scatter_along(ranges: np.ndarray, sigma_n: float) -> np.ndarray:
+    """(n,) standard deviation of a moving pair's ranges (n,) around each of them, sigma_n of too few [m].
+
+    From second differences: a model-free one, so that it can tell a range through walls from a place that is not yet
+    right.
+    """
+    if len(ranges) < _WINDOW:
+        return np.full(len(ranges), sigma_n)
+    second = np.abs(ranges[2:] - 2 * ranges[1:-1] + ranges[:-2])
+    window = np.lib.stride_tricks.sliding_window_view(second, min(_WINDOW, len(second)))
+    # the median of |x| of a normal x is 0.674 sigma, and a second difference has 6 sigma^2
+    sigma = np.median(window, axis=1) / (0.674 * np.sqrt(6.0))
+    at = np.clip(np.arange(len(ranges)) - 1 - window.shape[1] // 2, 0, len(sigma) - 1)
+    return sigma[at]
+
+
+def median_range(ranges: np.ndarray, sigma_n: float) -> tuple[float, float, float]:
+    """Median of ranges (n,) between two nodes at rest, its standard deviation, and theirs [m]."""
+    middle = float(np.median(ranges))
+    scatter = float(np.median(np.abs(ranges - middle))) / 0.674 if len(ranges) >= _FEWEST_OF_PAIR else sigma_n
+    # a median of n is as good as a mean of 0.64 n
+    return middle, mean_sigma(0.64 * len(ranges), scatter, sigma_n), scatter

@@ -1,11 +1,13 @@
 """A sparse least-squares problem put together row block by row block, and its minimum (float64, host).
 
-Only the normal equations are kept: a run of hours has many times as many rows as they have entries.
+Only the normal equations are kept: a run of hours has many times as many rows as they have entries. Of few unknowns
+they are dense: what is known of their sparsity would cost more than it saves.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from functools import cached_property
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -16,6 +18,8 @@ from uwbslam_jax import process
 
 _BLOCK = 2048
 """So many rows are put together at a time."""
+_FEW = 300
+"""Up to so many unknowns the normal equations are dense."""
 _LARGE = 500_000
 """Entries of normal equations that take memory worth the milliseconds of handing it back: some 3000 keyframes."""
 
@@ -27,6 +31,10 @@ class Sink(Protocol):
     def add(self, residual: np.ndarray, parts: Iterable[tuple[np.ndarray, np.ndarray]]) -> None:
         """Residuals (R,) and, for each unknown that they depend on, its column (R,) and derivative (R,)."""
         ...
+
+
+Fill = Callable[[np.ndarray, Sink], None]
+"""Puts all rows at some unknowns into a sink."""
 
 
 class Cost:
@@ -44,6 +52,51 @@ class Normal(NamedTuple):
 
     A: sparse.csr_array
     b: np.ndarray
+
+    def diagonal(self) -> np.ndarray:
+        """(U,) of A."""
+        return self.A.diagonal()
+
+    def solved(self, diagonal: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Solution for b (U,) or (U, C) with another diagonal (U,); A has it from then on."""
+        self.A.setdiag(diagonal)
+        return _factor(self.A.T).solve(b)
+
+
+class Dense:
+    """The same of few unknowns. cost: half the sum of the squared residuals."""
+
+    def __init__(self, rank: np.ndarray):
+        self._rank, self.cost = rank, 0.0
+        self._J, self._r = [np.zeros((0, len(rank)))], [np.zeros(0)]
+
+    def add(self, residual: np.ndarray, parts: Iterable[tuple[np.ndarray, np.ndarray]]) -> None:
+        rows, J = np.arange(len(residual)), np.zeros((len(residual), len(self._rank)))
+        for column, value in parts:
+            J[rows, self._rank[column]] += value
+        self.cost += 0.5 * float(residual @ residual)
+        self._J.append(J)
+        self._r.append(residual)
+
+    @cached_property
+    def A(self) -> np.ndarray:
+        """(U, U)."""
+        J = np.concatenate(self._J)
+        return J.T @ J
+
+    @property
+    def b(self) -> np.ndarray:
+        """(U,)."""
+        return np.concatenate(self._J).T @ np.concatenate(self._r)
+
+    def diagonal(self) -> np.ndarray:
+        """(U,) of A."""
+        return self.A.diagonal().copy()
+
+    def solved(self, diagonal: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Solution for b (U,) or (U, C) with another diagonal (U,); A has it from then on."""
+        np.fill_diagonal(self.A, diagonal)
+        return np.linalg.solve(self.A, b)
 
 
 class Rows:
@@ -96,26 +149,24 @@ def _factor(A: sparse.csc_array, order: str = "NATURAL") -> SuperLU:
 
 
 def minimise(
-    fill: Callable[[np.ndarray, Sink], None], x: np.ndarray, rank: np.ndarray, *, moves: int, enough: float
+    fill: Fill, x: np.ndarray, rank: np.ndarray, *, moves: int, enough: float, damping: float = 1e-6
 ) -> tuple[np.ndarray, float]:
     """Levenberg-Marquardt from x (U,): unknowns and cost.
 
     Args:
-      fill: puts all rows at some unknowns into a sink.
       rank: (U,) in which order the unknowns are eliminated.
       moves: so many at most. enough: a move that gains less than this is the last.
+      damping: of the first move, as a share of the diagonal: far from the minimum a large one keeps to the valley.
     """
-    cost, damping = _cost(fill, x), 1e-6
-    normal, diagonal = None, np.zeros(0)
+    cost, normal = _costed(fill, x, rank)
+    diagonal = None
     for _ in range(moves):
-        if normal is None:
-            normal = _linearised(fill, x, rank)
-            diagonal = normal.A.diagonal()
-        normal.A.setdiag(diagonal + damping * (diagonal + 1e-9))
-        moved = x - _factor(normal.A.T).solve(normal.b)[rank]
-        new_cost = _cost(fill, moved)
+        normal = normal or _linearised(fill, x, rank)
+        diagonal = normal.diagonal() if diagonal is None else diagonal
+        moved = x - normal.solved(diagonal + damping * (diagonal + 1e-9), normal.b)[rank]
+        new_cost, there = _costed(fill, moved, rank)
         if new_cost < cost:
-            gain, x, cost, normal = cost - new_cost, moved, new_cost, None
+            gain, x, cost, normal, diagonal = cost - new_cost, moved, new_cost, there, None
             damping = max(damping / 10, 1e-12)
             if gain < enough:
                 break
@@ -126,24 +177,33 @@ def minimise(
     return x, cost
 
 
-def covariance(
-    fill: Callable[[np.ndarray, Sink], None], x: np.ndarray, rank: np.ndarray, columns: np.ndarray
-) -> np.ndarray:
+def covariance(fill: Fill, x: np.ndarray, rank: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """(C, C) covariance at x (U,) of some unknowns (C,), all others free; fill and rank as in `minimise`."""
-    A = _linearised(fill, x, rank).A
-    A.setdiag(A.diagonal() + 1e-9)
+    normal = _linearised(fill, x, rank)
     unit = np.zeros((len(x), len(columns)))
     unit[rank[columns], np.arange(len(columns))] = 1.0
-    return _factor(A.T).solve(unit)[rank[columns]]
+    return normal.solved(normal.diagonal() + 1e-9, unit)[rank[columns]]
 
 
-def _cost(fill: Callable[[np.ndarray, Sink], None], x: np.ndarray) -> float:
+def cost_of(fill: Fill, x: np.ndarray) -> float:
+    """Half the sum of the squared residuals at x (U,)."""
     sink = Cost()
     fill(x, sink)
     return sink.cost
 
 
-def _linearised(fill: Callable[[np.ndarray, Sink], None], x: np.ndarray, rank: np.ndarray) -> Normal:
+def _costed(fill: Fill, x: np.ndarray, rank: np.ndarray) -> tuple[float, Dense | None]:
+    """The cost at x, with the normal equations where these are as quickly had."""
+    if len(x) > _FEW:
+        return cost_of(fill, x), None
+    rows = Dense(rank)
+    fill(x, rows)
+    return rows.cost, rows
+
+
+def _linearised(fill: Fill, x: np.ndarray, rank: np.ndarray) -> Normal | Dense:
+    if len(x) <= _FEW:
+        return _costed(fill, x, rank)[1]
     rows = Rows(rank)
     fill(x, rows)
     normal = rows.normal()

@@ -57,7 +57,7 @@ def solve(buffer: Buffer, ids: dict[int, int]) -> Outcome:
     if buffer.extent < _MOVED_ENOUGH_M and not any(key.blind for key in buffer.keyframes[1:]):
         return Outcome(RunStatus.WAITING, 0, 0.0, None)
     problem = Problem.build(buffer)
-    if len(problem.slots) < 2:
+    if problem is None:
         return Outcome(RunStatus.PLACING, 0, 0.0, None)
     found, bias_sigma = _explain(problem)
     best, biased = found[0], bias_sigma > CALIBRATED_M

@@ -12,7 +12,7 @@ from itertools import pairwise, product
 
 import numpy as np
 
-from uwbslam_jax.numerics import multilaterate, rotation_matrix, soften, turned
+from uwbslam_jax.numerics import multilaterate, rotation_matrix, scaled, soften, turned
 from uwbslam_jax.startup.placement import Placement, Problem
 
 _ANGLES = 72
@@ -52,14 +52,14 @@ def explanations(problem: Problem, bias_sigma: float) -> list[Placement]:
 def track_sides(problem: Problem) -> list[np.ndarray]:
     """Beacon positions (B, 2) by the track: the sides that fit best what was ranged along it and between the beacons,
     the next best ones, and the other side for all of the best."""
-    antenna = problem.antenna(problem.track)
+    antenna = problem.ranges.antenna(problem.track)
     spots = np.zeros((len(problem.slots), 2, 2))
     misfit = np.zeros((len(problem.slots), 2))
     for b in range(len(problem.slots)):
-        mine = problem.to == b
-        spots[b] = multilaterate(antenna[mine], problem.distance[mine], problem.sigma[mine])
+        mine = problem.ranges.to == b
+        spots[b] = multilaterate(antenna[mine], problem.ranges.distance[mine], problem.ranges.sigma[mine])
         apart = np.linalg.norm(antenna[mine, None] - spots[b], axis=2)
-        misfit[b] = _misfit(apart - problem.distance[mine, None], problem.sigma[mine, None]).sum(0)
+        misfit[b] = _misfit(apart - problem.ranges.distance[mine, None], problem.ranges.sigma[mine, None]).sum(0)
     choices = _best_sides(problem, spots, misfit)
     every = np.arange(len(spots))
     return [spots[every, choice] for choice in [*choices, 1 - choices[0]]]
@@ -93,13 +93,13 @@ def _side_cost(problem: Problem, spots: np.ndarray, misfit: np.ndarray, choices:
     """(C,) misfit of ranges along the track and between beacons for choices (C, B)."""
     every = np.arange(len(spots))
     cost = misfit[every, choices].sum(1)
-    if len(problem.pair):
+    if len(problem.pairs.ends):
         at = spots[every, choices]
-        apart = np.linalg.norm(at[:, problem.pair[:, 0]] - at[:, problem.pair[:, 1]], axis=2)
+        apart = np.linalg.norm(at[:, problem.pairs.ends[:, 0]] - at[:, problem.pairs.ends[:, 1]], axis=2)
         # the track is not exact, and what it errs by is in the places; that two beacons at rest are as far apart as
         # hundreds of ranges say is no outlier
-        sigma = np.hypot(problem.pair_sigma, _SAME_M)
-        cost = cost + (np.abs(apart - problem.pair_distance) / sigma).sum(1)
+        sigma = np.hypot(problem.pairs.sigma, _SAME_M)
+        cost = cost + (np.abs(apart - problem.pairs.distance) / sigma).sum(1)
     return cost
 
 
@@ -128,27 +128,18 @@ def laid_on_track(problem: Problem) -> list[tuple[np.ndarray, np.ndarray]]:
 def _relative_geometry(problem: Problem) -> np.ndarray | None:
     """(B, 2) positions of the beacons from the ranges between them: classical scaling, then least squares."""
     count = len(problem.slots)
-    if count < 3 or len(problem.pair) < 2 * count - 3:
+    i, j = problem.pairs.ends.T
+    if count < 3 or len(i) < 2 * count - 3 or len(np.union1d(i, j)) < count:
         return None
-    distance = np.full((count, count), np.inf)
-    np.fill_diagonal(distance, 0.0)
-    i, j = problem.pair.T
-    distance[i, j] = distance[j, i] = problem.pair_distance
-    for k in range(count):  # what is not heard is bounded by a way round
-        distance = np.minimum(distance, distance[:, k, None] + distance[None, k, :])
-    if not np.isfinite(distance).all():
-        return None
-    centre = np.eye(count) - 1.0 / count
-    values, vectors = np.linalg.eigh(-0.5 * centre @ distance**2 @ centre)
-    spots = vectors[:, -2:] * np.sqrt(np.maximum(values[-2:], 0.0))
+    spots = scaled(count, i, j, problem.pairs.distance)
     for _ in range(10):
         u = spots[i] - spots[j]
         d = np.maximum(np.linalg.norm(u, axis=1), 1e-6)
-        r, scale = soften((d - problem.pair_distance) / problem.pair_sigma)
+        r, scale = soften((d - problem.pairs.distance) / problem.pairs.sigma)
         J = np.zeros((len(d), 2 * count))
         rows = np.arange(len(d))
         for axis in range(2):
-            pull = scale / problem.pair_sigma * u[:, axis] / d
+            pull = scale / problem.pairs.sigma * u[:, axis] / d
             J[rows, 2 * i + axis], J[rows, 2 * j + axis] = pull, -pull
         spots = spots - np.linalg.solve(J.T @ J + 1e-3 * np.eye(2 * count), J.T @ r).reshape(-1, 2)
     return spots
@@ -158,10 +149,12 @@ def _path(problem: Problem, beacons: np.ndarray) -> tuple[np.ndarray, np.ndarray
     """Intervals (P,) in which the robot heard three beacons or more, and where it was among them (P, 2) [m]."""
     keys, path = [], []
     for k in range(len(problem.track)):
-        mine = problem.at == k
+        mine = problem.ranges.at == k
         if mine.sum() < 3:
             continue
-        spots = multilaterate(beacons[problem.to[mine]], problem.distance[mine], problem.sigma[mine])
+        spots = multilaterate(
+            beacons[problem.ranges.to[mine]], problem.ranges.distance[mine], problem.ranges.sigma[mine]
+        )
         # beacons nearly on a line leave two places: the robot is where it was
         near = spots[0] if not path else min(spots, key=lambda s: float(np.linalg.norm(s - path[-1])))
         better = spots[0] if len(problem.slots) > 3 else near
@@ -177,7 +170,7 @@ def _ways(problem: Problem, keys: np.ndarray, path: np.ndarray) -> np.ndarray:
     cov = np.zeros((len(moved), 2, 2))
     for m, (a, b) in enumerate(pairwise(keys)):
         for k in range(a, b):  # steps add up
-            root = np.linalg.inv(problem.roots[k])
+            root = np.linalg.inv(problem.edges.roots[k])
             R = rotation_matrix(problem.track[k, 2])
             cov[m] += R @ (root @ root.T)[:2, :2] @ R.T
     weight = np.linalg.inv(cov + 2 * _PATH_SIGMA**2 * np.eye(2))
@@ -191,11 +184,11 @@ def _ways(problem: Problem, keys: np.ndarray, path: np.ndarray) -> np.ndarray:
 
 def _centres(problem: Problem, poses: np.ndarray, keys: np.ndarray) -> np.ndarray:
     """(P, 2) mean place of the antenna over the ranges of each interval."""
-    antenna = problem.antenna(poses)
-    return np.array([antenna[problem.at == k].mean(0) for k in keys])
+    antenna = problem.ranges.antenna(poses)
+    return np.array([antenna[problem.ranges.at == k].mean(0) for k in keys])
 
 
-def _laid(problem: Problem, keys, path: np.ndarray, beacons: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _laid(problem: Problem, keys: np.ndarray, path: np.ndarray, beacons: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Beacons and poses of a path among beacons that was turned onto the track: moved to where the track began."""
     offset = path - _centres(problem, problem.track, keys)
     along = np.arange(len(problem.track))

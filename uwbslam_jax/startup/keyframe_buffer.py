@@ -6,7 +6,9 @@ track between two keyframes is not to be trusted and a range belongs to a place 
 
 from __future__ import annotations
 
+import math
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -14,7 +16,16 @@ import numpy as np
 
 from uwbslam_jax.estimator import Estimate
 from uwbslam_jax.measurements import Snapshot, StampedFrame
-from uwbslam_jax.numerics import mean_sigma, transformed, turned
+from uwbslam_jax.numerics import (
+    TrackRanges,
+    mean_sigma,
+    median_range,
+    near_middle,
+    scatter_along,
+    transformed,
+    turned,
+    widened,
+)
 from uwbslam_jax.settings import HostParams
 
 _MOVED = (0.25, 0.2)
@@ -27,10 +38,22 @@ _MOST_KEYFRAMES = 64
 """A longer start is thinned: every other keyframe goes."""
 _MOST_SIGHTINGS = 3000
 _MOST_OF_PAIR = 400
-_WINDOW = 21
-"""So many ranges of a pair around one tell how much they scatter there."""
-_WILD_M = 0.5
-"""A range this far from the median of its interval takes no part in the mean."""
+_LATEST = 42
+"""So many of a pair's newest ranges tell how much they scatter when start-up ends."""
+
+
+def is_blind(information: np.ndarray) -> np.ndarray | np.bool_:
+    """(...) whether scans with some information about the pose (..., 3, 3) do not tell where they are."""
+    return np.linalg.eigvalsh(information[..., :2, :2])[..., 0] < _BLIND_M**-2
+
+
+def is_far(pose: np.ndarray, last: np.ndarray, elapsed: int, blind: Callable[[], bool]) -> bool:
+    """Whether a pose (3,) is to be a keyframe, so long after the last one [ns] and perhaps blind."""
+    # plain numbers: asked for every frame
+    (x, y, yaw), (x0, y0, yaw0) = pose.tolist(), last.tolist()
+    turn = math.remainder(yaw - yaw0, 2 * math.pi)
+    moved = math.hypot(x - x0, y - y0) > _MOVED[0] or abs(turn) > _MOVED[1]
+    return moved or (elapsed > _BLIND_S * 1e9 and blind())
 
 
 @dataclass(frozen=True)
@@ -60,7 +83,7 @@ class Keyframe:
     @property
     def blind(self) -> bool:
         """Whether nothing told how far the robot moved in some direction."""
-        return not self.odometry and bool(np.linalg.eigvalsh(self.information[:2, :2])[0] < _BLIND_M**-2)
+        return not self.odometry and bool(is_blind(self.information))
 
 
 class Sighting(NamedTuple):
@@ -69,25 +92,6 @@ class Sighting(NamedTuple):
     stamp: int
     pose: np.ndarray
     distance: float
-
-
-class Averages(NamedTuple):
-    """Ranges of the robot to the beacons, averaged over halves of the intervals between keyframes.
-
-    Attributes:
-      at: (R,) keyframe before; to: (R,) slot.
-      share: (R,) how far on the way to the next keyframe, 0 to 1.
-      before, after: (R, 2) where the antenna was, in the frame of the keyframe before and of the one after [m].
-      distance, sigma: (R,) [m].
-    """
-
-    at: np.ndarray
-    to: np.ndarray
-    share: np.ndarray
-    before: np.ndarray
-    after: np.ndarray
-    distance: np.ndarray
-    sigma: np.ndarray
 
 
 class Buffer:
@@ -148,9 +152,7 @@ class Buffer:
 
     def _far_from_last(self, key: Keyframe) -> bool:
         last = self.keyframes[-1]
-        moved = key.pose - last.pose
-        blind = key.blind and key.frame.stamp - last.frame.stamp > _BLIND_S * 1e9
-        return bool(np.hypot(*moved[:2]) > _MOVED[0] or abs(moved[2]) > _MOVED[1] or blind)
+        return is_far(key.pose, last.pose, key.frame.stamp - last.frame.stamp, lambda: key.blind)
 
     def _add_range(self, frame: StampedFrame, k: int, pose: np.ndarray, velocity: np.ndarray, yaw_rate: float) -> None:
         r = frame.frame.ranges
@@ -175,17 +177,13 @@ class Buffer:
             kept.append(self.keyframes[-1])
         self.keyframes = kept
 
-    def averages(self, keys: list[Keyframe]) -> Averages:
-        """The robot's ranges averaged over the intervals between keyframes."""
+    def averages(self, keys: list[Keyframe]) -> list[TrackRanges]:
+        """The robot's ranges averaged over halves of the intervals between keyframes, of one slot each in order."""
         stamps = np.array([key.frame.stamp for key in keys], float)
         poses = np.array([key.pose for key in keys])
-        parts = [self._average_slot(slot, stamps, poses) for slot in sorted(self.sightings)]
-        if not parts:
-            none, number = np.zeros(0), np.zeros(0, int)
-            return Averages(number, number, none, np.zeros((0, 2)), np.zeros((0, 2)), none, none)
-        return Averages(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+        return [self._average_slot(slot, stamps, poses) for slot in sorted(self.sightings)]
 
-    def _average_slot(self, slot: int, stamps: np.ndarray, poses: np.ndarray) -> Averages:
+    def _average_slot(self, slot: int, stamps: np.ndarray, poses: np.ndarray) -> TrackRanges:
         kept = self.sightings[slot]
         stamp = np.array([s.stamp for s in kept], float)
         pose, distance = np.array([s.pose for s in kept]), np.array([s.distance for s in kept])
@@ -195,53 +193,29 @@ class Buffer:
         share = np.clip(share, 0.0, 1.0)
         antenna = transformed(pose, self.host.antenna)
         local = [turned(-poses[k, 2], antenna - poses[k, :2]) for k in (at, after)]
-        scatter = self._scatter(distance)
+        scatter, sigma_n = scatter_along(distance, self.host.sigma_n), self.host.sigma_n
         # two means in each interval: one would leave the keyframes free to move to and fro between their middles
         halves = 2 * at + (share >= 0.5)
         groups = np.unique(halves)
         rows = []
         for k in groups:
             mine = np.flatnonzero(halves == k)
-            middle = np.sort(distance[mine])[len(mine) // 2]  # one of them, so that at least one is near it
-            ok = mine[np.abs(distance[mine] - middle) < _WILD_M]
-            sigma = mean_sigma(len(ok), float(np.median(scatter[mine])), self.host.sigma_n)
+            ok = mine[near_middle(distance[mine])]
+            sigma = mean_sigma(len(ok), float(np.median(scatter[mine])), sigma_n)
             rows.append((share[ok].mean(), local[0][ok].mean(0), local[1][ok].mean(0), distance[ok].mean(), sigma))
         share, before, after, distance, sigma = (np.array(column) for column in zip(*rows, strict=True))
-        # a wall makes all of its ranges too long: many of them tell no more than one
-        walled = sigma > mean_sigma(1, self.host.sigma_n, self.host.sigma_n)
-        sigma = np.where(walled, sigma * np.sqrt(max(np.sum(walled), 1)), sigma)
-        return Averages(groups // 2, np.full(len(groups), slot), share, before, after, distance, sigma)
-
-    def _scatter(self, distance: np.ndarray) -> np.ndarray:
-        """(R,) standard deviation of a pair's ranges around each of them, from second differences: a model-free one,
-        so that it can tell a range through walls from a place that is not yet right."""
-        if len(distance) < _WINDOW:
-            return np.full(len(distance), self.host.sigma_n)
-        second = np.abs(distance[2:] - 2 * distance[1:-1] + distance[:-2])
-        window = np.lib.stride_tricks.sliding_window_view(second, min(_WINDOW, len(second)))
-        # the median of |x| of a normal x is 0.674 sigma, and a second difference has 6 sigma^2
-        sigma = np.median(window, axis=1) / (0.674 * np.sqrt(6.0))
-        at = np.clip(np.arange(len(distance)) - 1 - window.shape[1] // 2, 0, len(sigma) - 1)
-        return sigma[at]
+        sigma = widened(sigma, sigma > mean_sigma(1, sigma_n, sigma_n), np.zeros(len(groups), int))
+        at, to = groups // 2, np.full(len(groups), slot)
+        next_one = np.minimum(at + 1, len(stamps) - 1)
+        return TrackRanges(at, next_one, to, share, before, after, distance, 0.0 * distance, sigma)
 
     def scatter(self, nodes: int) -> np.ndarray:
         """(K, K) log of how many times sigma_n each pair's latest ranges scatter, at least 0, see ranging."""
         found = np.zeros((nodes, nodes))
         for slot, kept in self.sightings.items():
-            latest = np.array([s.distance for s in kept])[-2 * _WINDOW :]
-            found[0, slot] = found[slot, 0] = self._scatter(latest)[-1]
+            latest = np.array([s.distance for s in kept])[-_LATEST:]
+            found[0, slot] = found[slot, 0] = scatter_along(latest, self.host.sigma_n)[-1]
         for (i, j), kept in self.pairs.items():
-            latest = np.array(kept)[-2 * _WINDOW :]
-            found[i, j] = found[j, i] = np.median(np.abs(latest - np.median(latest))) / 0.674
+            latest = np.array(kept)[-_LATEST:]
+            found[i, j] = found[j, i] = median_range(latest, self.host.sigma_n)[2]
         return np.log(np.maximum(found / self.host.sigma_n, 1.0))
-
-    def pair_medians(self) -> dict[tuple[int, int], tuple[float, float]]:
-        """(i, j) -> median range between two beacons and its standard deviation [m]."""
-        found = {}
-        for pair, kept in self.pairs.items():
-            values = np.array(kept)
-            middle = float(np.median(values))
-            scatter = float(np.median(np.abs(values - middle))) / 0.674 if len(values) >= 5 else self.host.sigma_n
-            # a median of n is as good as a mean of 0.64 n
-            found[pair] = middle, mean_sigma(0.64 * len(values), scatter, self.host.sigma_n)
-        return found

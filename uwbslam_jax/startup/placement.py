@@ -6,26 +6,42 @@ Chains of poses with millimetre steps are beyond float32, and the problem runs o
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
 from uwbslam_jax.numerics import (
     CALIBRATED_M,
     DECIDED,
+    Edges,
+    Pairs,
+    PoseGraph,
+    Stage,
+    TrackRanges,
     between,
+    cost_of,
+    covariance,
     largest_sigma,
+    median_range,
     multilaterate,
     rotation_matrix,
-    soften,
-    transformed,
+    wrapped,
 )
 from uwbslam_jax.startup.keyframe_buffer import Buffer, Keyframe
 
+_LOOSE_WHEELS = (0.03, 0.06, 0.02, 0.06)
+"""Standard deviation of a step by wheels, see `step_sigma`."""
+_LOOSE = (0.1, 0.2, 0.05, 0.1)
+"""The same of a step that nothing measured, without what it may have driven in the time."""
+_LONGEST_S = 3.0
+"""So long at most counts with a metre a second."""
+_DRIFT = (0.005, 0.01, 0.002, 0.003)
+"""The same of what the map that a scan is matched with drifts on the step."""
 _MOST_MOVES = 20
-_COARSE = (8.0, 1.0)
+_STAGES = (Stage(soft=np.inf, coarse=8.0), Stage(soft=np.inf, coarse=1.0))
 """The problem is solved twice: first a range may err by so many times as much, or where the start is wrong by more than
 the radio errs all its ranges were outliers, and a beacon could as well be anywhere."""
+_FEWEST_MEANS = 3
+"""A beacon ranged less takes no part: so many averages over half an interval between keyframes."""
 _ENOUGH = 0.02
 """The batch problem is solved when a move gains less log-likelihood than this."""
 
@@ -69,71 +85,45 @@ class Placement:
 
 
 @dataclass(frozen=True)
-class Problem:
-    """The batch problem in arrays. N keyframes, B beacons, R averaged ranges, E pairs of beacons.
+class Problem(PoseGraph):
+    """The batch problem in arrays.
 
-    steps (N-1, 3) relative poses with roots (N-1, 3, 3) of their information; at, after (R,) keyframes before and
-    after a range, share (R,) of the way between them, local_at, local_after (R, 2) the antenna in their frames, to
-    (R,) beacon index, distance, sigma (R,); pair (E, 2) beacon indices, pair_distance, pair_sigma (E,).
+    Attributes:
+      slots: (B,) of the beacons. track: (N, 3) the keyframes as the track has them [m, m, rad].
     """
 
     slots: list[int]
     track: np.ndarray
-    steps: np.ndarray
-    roots: np.ndarray
-    at: np.ndarray
-    after: np.ndarray
-    share: np.ndarray
-    local_at: np.ndarray
-    local_after: np.ndarray
-    to: np.ndarray
-    distance: np.ndarray
-    sigma: np.ndarray
-    pair: np.ndarray
-    pair_distance: np.ndarray
-    pair_sigma: np.ndarray
 
     @staticmethod
-    def build(buffer: Buffer) -> Problem:
-        """Arrays of what was buffered; only beacons ranged from at least three intervals take part."""
+    def build(buffer: Buffer) -> Problem | None:
+        """Arrays of what was buffered, with the beacons ranged often enough; None where these are not two."""
         keys = buffer.track()
-        seen = buffer.averages(keys)
-        slots = [int(s) for s, count in zip(*np.unique(seen.to, return_counts=True), strict=True) if count >= 3]
-        index = {slot: b for b, slot in enumerate(slots)}
-        ok = np.isin(seen.to, slots)
-        pairs = [(index[i], index[j], *m) for (i, j), m in buffer.pair_medians().items() if i in index and j in index]
-        steps, roots = _steps(keys)
+        seen = [means for means in buffer.averages(keys) if len(means.at) >= _FEWEST_MEANS]
+        index = {int(means.to[0]): b for b, means in enumerate(seen)}
+        if len(seen) < 2:
+            return None
+        seen = [means._replace(to=np.full(len(means.at), b)) for b, means in enumerate(seen)]
+        pairs = [
+            (index[i], index[j], middle, 0.0, sigma)
+            for (i, j), kept in buffer.pairs.items()
+            if i in index and j in index
+            for middle, sigma, _ in [median_range(np.array(kept), buffer.host.sigma_n)]
+        ]
         return Problem(
-            slots=slots,
+            count=len(keys),
+            bias_of=1 + np.arange(len(index)),
+            edges=_steps(keys),
+            ranges=TrackRanges(*(np.concatenate(column) for column in zip(*seen, strict=True))),
+            pairs=Pairs.of(pairs),
+            slots=list(index),
             track=np.array([key.pose for key in keys]),
-            steps=steps,
-            roots=roots,
-            at=seen.at[ok],
-            after=np.minimum(seen.at[ok] + 1, len(keys) - 1),
-            share=seen.share[ok],
-            local_at=seen.before[ok],
-            local_after=seen.after[ok],
-            to=np.array([index[int(s)] for s in seen.to[ok]], int),
-            distance=seen.distance[ok],
-            sigma=seen.sigma[ok],
-            pair=np.array([p[:2] for p in pairs], int).reshape(-1, 2),
-            pair_distance=np.array([p[2] for p in pairs]),
-            pair_sigma=np.array([p[3] for p in pairs]),
         )
-
-    def antenna(self, poses: np.ndarray) -> np.ndarray:
-        """(R, 2) where the robot's antenna was when each range was taken, between its two keyframes [m]."""
-        ends = self._antenna_ends(poses)
-        return (1 - self.share)[:, None] * ends[0] + self.share[:, None] * ends[1]
-
-    def _antenna_ends(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The same as either keyframe alone would have it."""
-        return transformed(poses[self.at], self.local_at), transformed(poses[self.after], self.local_after)
 
     def images(self, placement: Placement) -> list[tuple[np.ndarray, np.ndarray]]:
         """Beacons and poses of a placement mirrored along, across and through the start of the line that the robot's
         antenna drove best along: a straight drive leaves the first one open, a blind corridor the others as well."""
-        antenna = self.antenna(placement.poses)
+        antenna = self.ranges.antenna(placement.poses)
         _, _, axes = np.linalg.svd(antenna - antenna.mean(0), full_matrices=False)
         found = []
         for along, across in ((1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)):
@@ -154,148 +144,64 @@ class Problem:
           beacons: (B, 2) [m]. poses: (N, 3) to start from instead of the track.
           bias_sigma: prior spread of each node's range bias [m].
         """
-        n, m = self.track.size, self.track.size + 2 * len(self.slots)
-        start = self.track if poses is None else poses
-        x = np.concatenate([start.ravel(), beacons.ravel(), np.zeros(1 + len(self.slots))])
-        for coarse in _COARSE:
-            x, J, cost = self._descend(x, bias_sigma, coarse)
-        cov = np.linalg.inv(J.T @ J + 1e-9 * np.eye(J.shape[1]))
-        return Placement(
-            x[:n].reshape(-1, 3),
-            self.slots,
-            x[n:m].reshape(-1, 2),
-            cost,
-            cov[:m, :m],
-            x[m:],
-            np.sqrt(np.diag(cov)[m:]),
-        )
-
-    def _descend(self, x: np.ndarray, bias_sigma: float, coarse: float) -> tuple[np.ndarray, np.ndarray, float]:
-        """Unknowns, their Jacobian and the cost where a descent from x ends."""
-        damping = 1e-3
-        J, r = self._linearise(x, bias_sigma, coarse)
-        cost = 0.5 * r @ r
-        for _ in range(_MOST_MOVES):
-            A, g = J.T @ J, J.T @ r
-            moved = x - np.linalg.solve(A + damping * np.diag(np.diag(A) + 1e-9), g)
-            new_J, new_r = self._linearise(moved, bias_sigma, coarse)
-            new_cost = 0.5 * new_r @ new_r
-            if new_cost < cost:
-                done = cost - new_cost < _ENOUGH
-                x, J, r, cost = moved, new_J, new_r, new_cost
-                damping = max(damping / 5, 1e-9)
-                if done:
-                    break
-            else:
-                damping *= 10
-                if damping > 1e6:
-                    break
-        return x, J, float(cost)
-
-    def _linearise(self, x: np.ndarray, bias_sigma: float, coarse: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-        """Whitened Jacobian (rows, 3 N + 2 B + 1 + B) and residuals of held start, steps, ranges, pairs and biases."""
-        n, m = self.track.size, self.track.size + 2 * len(self.slots)
-        poses, beacons, bias = x[:n].reshape(-1, 3), x[n:m].reshape(-1, 2), x[m:]
-        blocks = [self._hold_start(poses, len(x)), self._step_rows(poses, len(x))]
-        blocks += [self._range_rows(poses, beacons, bias, coarse)]
-        blocks += [self._pair_rows(beacons, bias, coarse, len(x))]
-        prior = np.zeros((len(bias), len(x)))
-        prior[:, m:] = np.eye(len(bias)) / bias_sigma
-        blocks.append((prior, bias / bias_sigma))
-        return np.concatenate([J for J, _ in blocks]), np.concatenate([r for _, r in blocks])
-
-    def _hold_start(self, poses, columns):
-        J = np.zeros((3, columns))
-        J[:, :3] = 1e4 * np.eye(3)
-        return J, 1e4 * (poses[0] - self.track[0])
-
-    def _step_rows(self, poses, columns):
-        a, b = poses[:-1], poses[1:]
-        m = len(a)
-        c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
-        R = np.stack([np.stack([c, s], -1), np.stack([-s, c], -1)], 1)  # (m, 2, 2), world to the earlier pose
-        u = b[:, :2] - a[:, :2]
-        moved = np.einsum("mij,mj->mi", R, u)
-        e = np.column_stack([moved, b[:, 2] - a[:, 2]]) - self.steps
-        local = np.zeros((m, 3, 6))
-        local[:, :2, :2], local[:, :2, 3:5] = -R, R
-        local[:, :2, 2] = -np.einsum("mij,mj->mi", R, np.stack([-u[:, 1], u[:, 0]], -1))
-        local[:, 2, 2], local[:, 2, 5] = -1.0, 1.0
-        J = np.zeros((m, 3, columns))
-        rows = np.arange(m)
-        for k in range(6):
-            J[rows, :, 3 * rows + k] = np.einsum("mij,mj->mi", self.roots, local[:, :, k])
-        return J.reshape(-1, columns), np.einsum("mij,mj->mi", self.roots, e).ravel()
-
-    def _range_rows(self, poses, beacons, bias, coarse):
-        ends = self._antenna_ends(poses)
-        antenna = (1 - self.share)[:, None] * ends[0] + self.share[:, None] * ends[1]
-        u = antenna - beacons[self.to]
-        d = np.maximum(np.linalg.norm(u, axis=1), 1e-6)
-        unit = u / d[:, None]
-        sigma = coarse * self.sigma
-        r, scale = soften((d + bias[0] + bias[1 + self.to] - self.distance) / sigma)
-        weight = scale / sigma
-        n, m = poses.size, poses.size + beacons.size
-        rows, J = np.arange(len(d)), np.zeros((len(d), m + len(bias)))
-        for key, end, part in ((self.at, ends[0], 1 - self.share), (self.after, ends[1], self.share)):
-            lever = end - poses[key, :2]
-            for axis in range(2):
-                J[rows, 3 * key + axis] += part * weight * unit[:, axis]
-            J[rows, 3 * key + 2] += part * weight * (unit[:, 1] * lever[:, 0] - unit[:, 0] * lever[:, 1])
-        for axis in range(2):
-            J[rows, n + 2 * self.to + axis] = -weight * unit[:, axis]
-        J[rows, m], J[rows, m + 1 + self.to] = weight, weight
-        return J, r
-
-    def _pair_rows(self, beacons, bias, coarse, columns):
-        i, j = self.pair.T
-        u = beacons[i] - beacons[j]
-        d = np.maximum(np.linalg.norm(u, axis=1), 1e-6)
-        sigma = coarse * self.pair_sigma
-        r, scale = soften((d + bias[1 + i] + bias[1 + j] - self.pair_distance) / sigma)
-        weight = scale / sigma
-        n, m = self.track.size, self.track.size + beacons.size
-        rows, J = np.arange(len(d)), np.zeros((len(d), columns))
-        for axis in range(2):
-            J[rows, n + 2 * i + axis] = weight * u[:, axis] / d
-            J[rows, n + 2 * j + axis] = -weight * u[:, axis] / d
-        J[rows, m + 1 + i], J[rows, m + 1 + j] = weight, weight
-        return J, r
+        x = self.joined(self.track if poses is None else poses, beacons)
+        x, cost = self.descend(x, bias_sigma, _STAGES, moves=_MOST_MOVES, enough=_ENOUGH, damping=1e-3)
+        cov = covariance(self.rows(x[:3], bias_sigma, _STAGES[-1]), x, self.rank, np.arange(len(x)))
+        poses, beacons, bias = self.split(x)
+        m = self.first_bias
+        return Placement(poses, self.slots, beacons, cost, cov[:m, :m], bias, np.sqrt(np.diag(cov)[m:]))
 
     def keep_unique(self, best: Placement, bias_sigma: float = CALIBRATED_M) -> Placement:
         """The placement without the beacons that have a second place which explains the ranges as well."""
-        antenna, sigma = self.antenna(best.poses), best.beacon_sigma()
+        antenna, sigma = self.ranges.antenna(best.poses), best.beacon_sigma()
+        rows = self.rows(best.poses[0], bias_sigma, _STAGES[-1])
         unique = []
         for b in range(len(self.slots)):
-            mine = self.to == b
-            distance = self.distance[mine] - best.bias[0] - best.bias[1 + b]
-            spots = np.stack(multilaterate(antenna[mine], distance, self.sigma[mine]))
+            mine = self.ranges.to == b
+            distance = self.ranges.distance[mine] - best.bias[0] - best.bias[1 + b]
+            spots = np.stack(multilaterate(antenna[mine], distance, self.ranges.sigma[mine]))
             away = spots[np.argmax(np.linalg.norm(spots - best.beacons[b], axis=1))]
             moved = best.beacons.copy()
             moved[b] = away
-            _, r = self._linearise(np.concatenate([best.poses.ravel(), moved.ravel(), best.bias]), bias_sigma)
+            there = cost_of(rows, np.concatenate([best.poses.ravel(), moved.ravel(), best.bias]))
             near = np.linalg.norm(away - best.beacons[b]) < max(4 * sigma[b], 0.3)
-            unique.append(near or 0.5 * r @ r - best.cost > DECIDED)
+            unique.append(near or there - best.cost > DECIDED)
         return best.only([b for b, ok in enumerate(unique) if ok])
 
 
-def _steps(keys: list[Keyframe]) -> tuple[np.ndarray, np.ndarray]:
-    """Relative poses of consecutive keyframes and the roots of their information, in the earlier one's frame."""
-    steps, roots = np.zeros((len(keys) - 1, 3)), np.zeros((len(keys) - 1, 3, 3))
-    for k, (a, b) in enumerate(pairwise(keys)):
-        steps[k] = between(a.pose, b.pose)
-        turn = rotation_matrix(a.pose[2], 3).T
-        length, angle = np.hypot(*steps[k, :2]), abs(steps[k, 2])
-        elapsed = (b.frame.stamp - a.frame.stamp) / 1e9
-        # where the match says nothing, wheels or the motion model still bound the step; where it says much, the map
-        # it was matched with has its own drift
-        if b.odometry:
-            loose = np.diag([0.03 + 0.06 * length, 0.03 + 0.06 * length, 0.02 + 0.06 * angle]) ** 2
-        else:
-            pace = 0.1 + 0.2 * length + min(elapsed, 3.0)
-            loose = np.diag([pace, pace, 0.05 + 0.1 * angle]) ** 2
-        tight = np.diag([0.005 + 0.01 * length, 0.005 + 0.01 * length, 0.002 + 0.003 * angle]) ** 2
-        cov = np.linalg.inv(turn @ b.information @ turn.T + np.linalg.inv(loose)) + tight
-        roots[k] = np.linalg.cholesky(np.linalg.inv(cov)).T
-    return steps, roots
+def _steps(keys: list[Keyframe]) -> Edges:
+    """Relative poses of consecutive keyframes, with the roots of their information in the earlier one's frame."""
+    new, poses = np.arange(1, len(keys)), np.array([key.pose for key in keys])
+    steps = between(poses[:-1], poses[1:])
+    elapsed = np.diff([key.frame.stamp for key in keys]) / 1e9
+    # where the match says nothing, wheels or the motion model still bound the step; where it says much, the map it was
+    # matched with has its own drift
+    loose = loose_sigma(steps, elapsed, np.array([key.odometry for key in keys[1:]]))
+    turn = np.array([rotation_matrix(-pose[2], 3) for pose in poses[:-1]])
+    told = turn @ np.array([key.information for key in keys[1:]]) @ turn.swapaxes(1, 2)
+    cov = np.linalg.inv(told + diagonal(loose**-2)) + diagonal(step_sigma(steps, _DRIFT) ** 2)
+    roots = np.linalg.cholesky(np.linalg.inv(cov)).swapaxes(1, 2)
+    return Edges(new - 1, new, steps, roots, np.zeros(len(new), bool))
+
+
+def loose_sigma(steps: np.ndarray, elapsed: np.ndarray, rolled: np.ndarray) -> np.ndarray:
+    """(n, 3) standard deviation of steps (n, 3) between keyframes by wheels, where these measured them (n,), or by
+    nothing, where the robot may have driven for the time that elapsed (n,) [s]."""
+    driven = np.minimum(elapsed, _LONGEST_S)[:, None] * np.array([1.0, 1.0, 0.0])
+    return np.where(rolled[:, None], step_sigma(steps, _LOOSE_WHEELS), step_sigma(steps, _LOOSE) + driven)
+
+
+def step_sigma(steps: np.ndarray, loose: tuple[float, float, float, float]) -> np.ndarray:
+    """(n, 3) standard deviation of steps by their lengths and turns [m, m, rad].
+
+    Args:
+      loose: floor and share of the way [m], floor and share of the turn [rad].
+    """
+    floor, share, floor_yaw, share_yaw = loose
+    along = floor + share * np.hypot(steps[:, 0], steps[:, 1])
+    return np.stack([along, along, floor_yaw + share_yaw * np.abs(wrapped(steps[:, 2]))], axis=-1)
+
+
+def diagonal(values: np.ndarray) -> np.ndarray:
+    """Diagonal matrices (n, 3, 3) of rows (n, 3)."""
+    return values[:, :, None] * np.eye(3)

@@ -14,10 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.optimize import least_squares
-from scipy.sparse.csgraph import shortest_path
 
 from uwbslam_jax.measurements import StampedFrame
-from uwbslam_jax.numerics import RANGE_FLOOR_M
+from uwbslam_jax.numerics import RANGE_FLOOR_M, scaled
 from uwbslam_jax.settings import HostParams
 
 _KEPT = 1024
@@ -245,25 +244,12 @@ def _starts(network: _Network) -> list[Float[np.ndarray, "u"]]:
     for share in shares:
         offset = share * float(network.distance.min())
         flat = np.sqrt(np.maximum((network.distance - offset) ** 2 - network.rise**2, 1e-4))
-        first = _scaled(network, flat)
+        first = scaled(network.count, network.i, network.j, flat).ravel()
         starts.append(np.append(first, offset))
         if not complete:
             spread = float(first.std()) or 1.0
             starts += [np.append(rng.normal(0.0, spread, first.size), offset) for _ in range(_RANDOM_STARTS)]
     return starts
-
-
-def _scaled(network: _Network, flat: Float[np.ndarray, "L"]) -> Float[np.ndarray, "n"]:
-    """Classical multidimensional scaling of the distances; missing ones are the shortest way round."""
-    n = network.count
-    known = np.full((n, n), np.inf)
-    known[network.i, network.j] = known[network.j, network.i] = flat
-    square = shortest_path(known, directed=False) ** 2
-    # two groups of nodes without a link between them: any distance will do, the rank tells later
-    square[~np.isfinite(square)] = square[np.isfinite(square)].max()
-    centre = np.eye(n) - 1.0 / n
-    values, vectors = np.linalg.eigh(-0.5 * centre @ square @ centre)
-    return (vectors[:, -2:] * np.sqrt(np.maximum(values[-2:], 1e-6))).ravel()
 
 
 def _leave_out(network: _Network, x: np.ndarray, pairs: list[Pair]) -> tuple[_Network, np.ndarray, list[Pair]]:

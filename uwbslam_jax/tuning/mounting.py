@@ -61,7 +61,7 @@ class Mounting:
     @property
     def bias(self) -> int:
         """Column of the first bias."""
-        return self.problem.size - len(self.problem.slots)
+        return self.problem.first_bias
 
     @property
     def lidar(self) -> int:
@@ -112,9 +112,9 @@ class Mounting:
     def _scans(self, rows: Sink, x: Array) -> None:
         """The LiDAR's own motions. Compared in its own frame, where they are the same whatever the mounting is: in the
         robot's a turn of the frame would turn the residuals, and pass for something that they tell."""
-        p = self.problem
+        p = self.problem.edges
         keep = p.soft | ~self._rolled()[p.new]
-        old, new, measured, roots, soft = (a[keep] for a in (p.old, p.new, p.between, p.roots, p.soft))
+        old, new, measured, roots, soft = (column[keep] for column in p)
         columns = [*_columns(3 * old, 3), *_columns(3 * new, 3), *_shared(self.lidar, 3, len(old))]
         own, back = self.host.lidar[None], between(self.host.lidar[None], np.zeros(3))
         motion = compose(compose(back, measured), own)
@@ -173,11 +173,11 @@ class Mounting:
         return self.wheels[0] * factors[0], self.wheels[1] * factors[1]
 
     def _ranges(self, rows: Sink, x: Array) -> None:
-        p, n = self.problem, 3 * self.problem.count
+        p, n = self.problem.ranges, 3 * self.problem.count
         robot = np.full(len(p.at), self.bias)
         lidar = _shared(self.lidar, 3, len(p.at))
         columns = [*_columns(3 * p.at, 3), *_columns(3 * p.at + 3, 3), *_columns(n + 2 * p.to, 2), robot]
-        columns += [p.bias_column(p.to), *lidar]
+        columns += [self.problem.bias_column(p.to), *lidar]
         turn = wrapped(self.poses[p.at + 1, 2] - self.poses[p.at, 2])
 
         def residual(v: Array) -> Array:
@@ -187,8 +187,8 @@ class Mounting:
             shift = compose(back, np.append(self.host.antenna, 0.0))[:, :2] - self.host.antenna
             ends = []
             for pose, lever, angle in (
-                (v[:, :3], p.before, p.share * turn),
-                (v[:, 3:6], p.after, (p.share - 1) * turn),
+                (v[:, :3], p.lever_at, p.share * turn),
+                (v[:, 3:6], p.lever_after, (p.share - 1) * turn),
             ):
                 moved = lever + turned(angle, shift)
                 ends.append(transformed(pose, transformed(change, moved)))
