@@ -107,7 +107,7 @@ class HostParams:
         """How much higher the antenna of a slot stands than that of another [m]."""
         return self.height[i] - self.height[j]
 
-    def flat(self, measured: Metres, i: Slot, j: Slot) -> float | np.ndarray:
+    def flat(self, measured: Metres, i: Slot, j: Slot) -> Metres:
         """Distance in the plane [m]; at least 0.1, however short the range is."""
         return np.sqrt(np.maximum(self.slant(measured, i, j) ** 2 - self.rise(i, j) ** 2, 0.01))
 
