@@ -80,21 +80,6 @@ def loosen(state: State, slot: int, variance: float) -> State:
     return state._replace(belief=state.belief._replace(cov=state.belief.cov.at[at, at].add(variance)))
 
 
-def put_beacons(state: State, slots: list[int], places: np.ndarray, cov: np.ndarray) -> State:
-    """The state with beacons where the whole run says they stand.
-
-    Args:
-      places: (B, 2) [m]; cov: (2 B, 2 B), by themselves: what ties them to the robot's own track is in it.
-    """
-    own = np.concatenate([[2 * slot, 2 * slot + 1] for slot in slots])
-    P = np.array(state.belief.cov, float)
-    P[own, :] = P[:, own] = 0.0
-    P[np.ix_(own, own)] = cov + RANGE_FLOOR_M**2 * np.eye(len(own))
-    mean = np.array(state.belief.mean, float)
-    mean[own] = places.ravel()
-    return state._replace(belief=Gaussian(jnp.asarray(mean, jnp.float32), jnp.asarray(P, jnp.float32)))
-
-
 def put_robot(state: State, position: np.ndarray) -> State:
     """The state with the robot somewhere else: at rest, heading unknown, the map where it was."""
     k = state.active.shape[0]
