@@ -110,7 +110,8 @@ class HostParams:
 
     def flat(self, measured: Metres, i: Slot, j: Slot) -> Metres:
         """Distance in the plane [m]; at least 0.1, however short the range is."""
-        return np.sqrt(np.maximum(self.slant(measured, i, j) ** 2 - self.rise(i, j) ** 2, 0.01))
+        flat: Any = np.sqrt(np.maximum(self.slant(measured, i, j) ** 2 - self.rise(i, j) ** 2, 0.01))
+        return flat
 
     def usable(self, ranges: Ranges) -> Bool[np.ndarray, "M"]:
         """Which ranges of a frame are measured, and not NLOS by their powers; see `ranging.line_of_sight`."""

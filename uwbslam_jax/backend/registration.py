@@ -97,7 +97,7 @@ def register(old: View, new: View, guess: Float[Array, "n 3"]) -> Registration:
 
 
 def _register(old: View, new: View, guess: Float[Array, "3"]) -> Registration:
-    def move(pose, scale):
+    def move(pose: Float[Array, "3"], scale: Float[Array, ""]) -> tuple[Float[Array, "3"], None]:
         gram, *_ = _gram(old, new, pose, scale)
         A = gram[:3, :3] + jnp.diag(jnp.array([1.0, 1.0, 10.0]))
         # three unknowns by Cramer's rule: LAPACK would take longer than all the rest
@@ -129,7 +129,9 @@ def _some(valid: Bool[Array, "B"]) -> tuple[Int[Array, "n"], Bool[Array, "n"]]:
     return with_return[rank], rank < count
 
 
-def _gram(old: View, new: View, pose, scale):
+def _gram(
+    old: View, new: View, pose: Float[Array, "3"], scale: float | Float[Array, ""]
+) -> tuple[Float[Array, "4 4"], Float[Array, "3 n"], Float[Array, "n"], Bool[Array, "n"], Bool[Array, "n"]]:
     """Weighted Gram matrix (4, 4) of derivatives by the pose and distances of points from the lines they fall on [m];
     the derivatives (3, n), the weights, which points are on a line, and which fall where the older scan has returns."""
     p = transform_points(pose, new.points)

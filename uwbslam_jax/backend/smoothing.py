@@ -115,7 +115,7 @@ class Problem(PoseGraph):
             if a in index and b in index and len(kept) >= 3:
                 middle, spread, _ = median_range(np.array(kept), host.sigma_n)
                 pairs.append((index[a], index[b], host.slant(middle, a[0], b[0]), host.rise(a[0], b[0]), spread))
-        distance, rise = host.slant(means["distance"].astype(float), 0, slot), host.rise(0, slot)
+        distance, rise = host.slant(means["distance"].astype(float), 0, slot), np.asarray(host.rise(0, slot))
         share, before, after = (means[name].astype(float) for name in ("share", "before", "after"))
         ranges = TrackRanges(means["at"], means["at"] + 1, to, share, before, after, distance, rise, sigma)
         return Problem(

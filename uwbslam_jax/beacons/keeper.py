@@ -1,4 +1,4 @@
-"""A beacon's life after start-up (DESIGN 1.7): joining, falling silent, being carried, coming back; the robot's too.
+"""A beacon's life after start-up: joining, falling silent, being carried, coming back; the robot's too.
 
 Host code that looks at a few frames at a time. A beacon that is not in the state is placed from its newest ranges to
 nodes of known place, at rest or carried, when they leave one place only. One whose ranges say that it moves is taken

@@ -17,7 +17,6 @@ class Heard(NamedTuple):
     """R usable ranges in order of their frames.
 
     Attributes:
-      frame: (R,) number of the frame.
       stamp: (R,) of the frame, int64 [ns]. age: (R,) of the range relative to it [s].
       i, j: (R,) slots.
       flat: (R,) distance in the plane, biases and heights taken off [m].
@@ -26,7 +25,6 @@ class Heard(NamedTuple):
       rests_i, rests_j: (R,) whether the node is in the state and not carried.
     """
 
-    frame: np.ndarray
     stamp: np.ndarray
     age: np.ndarray
     i: np.ndarray
@@ -52,7 +50,6 @@ def heard(pending: Sequence[tuple[StampedFrame, Estimate]], host: HostParams) ->
     pose, velocity, yaw_rate = (of_estimates(name).astype(float)[f] for name in ("pose", "velocity", "yaw_rate"))
     rests = of_estimates("active") & ~of_estimates("moving")
     return Heard(
-        frame=f,
         stamp=np.array([frame.stamp for frame, _ in pending], np.int64)[f],
         age=age,
         i=i,

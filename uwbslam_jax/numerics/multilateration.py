@@ -59,7 +59,7 @@ def multilaterate(anchors: np.ndarray, distance: np.ndarray, sigma: np.ndarray) 
     first = np.argmin(sigma)
     angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     spots = anchors[first] + distance[first] * np.stack([np.cos(angle), np.sin(angle)], -1)
-    states, cost = _descend(spots, np.zeros(len(distance)), anchors, distance, sigma, _AT_REST)
+    states, cost = _descend(spots, _Ranges(np.zeros(len(distance)), anchors, distance, sigma), _AT_REST)
     order = np.argsort(cost)
     best = states[order[0], :2]
     apart = [k for k in order if np.linalg.norm(states[k, :2] - best) > _APART_M]
@@ -84,12 +84,13 @@ def fit(
       carried: whether the node may have a velocity, of `WALK_M_S`; otherwise it rests.
     """
     walk = WALK_M_S if carried else _AT_REST
-    states, cost = _descend(starts, time, anchors, distance, sigma, walk)
+    to = _Ranges(time, anchors, distance, sigma)
+    states, cost = _descend(starts, to, walk)
     found: list[int] = []
     for k in map(int, np.argsort(cost)):
         if all(np.linalg.norm(states[k, :2] - states[other, :2]) > _APART_M for other in found):
             found.append(k)
-    return [_spot(states[k], float(cost[k]), time, anchors, distance, sigma, walk) for k in found]
+    return [_spot(states[k], float(cost[k]), to, walk) for k in found]
 
 
 def settle(place: np.ndarray, anchors: np.ndarray, distance: np.ndarray, sigma: np.ndarray, common: np.ndarray) -> Spot:
@@ -119,6 +120,15 @@ def settle(place: np.ndarray, anchors: np.ndarray, distance: np.ndarray, sigma: 
     return Spot(here.place, np.zeros(2), both, here.cost, pull)
 
 
+class _Ranges(NamedTuple):
+    """Times (R,) [s], anchors (R, 2), distances and standard deviations (R,) [m] of ranges."""
+
+    time: np.ndarray
+    anchors: np.ndarray
+    distance: np.ndarray
+    sigma: np.ndarray
+
+
 class _Settled(NamedTuple):
     """A place (2,) with the residuals (R,), unit vectors (R, 2) and weights (R, R) of its ranges, and its cost."""
 
@@ -129,7 +139,9 @@ class _Settled(NamedTuple):
     cost: float
 
     @staticmethod
-    def at(place, anchors, distance, sigma, common) -> _Settled:
+    def at(
+        place: np.ndarray, anchors: np.ndarray, distance: np.ndarray, sigma: np.ndarray, common: np.ndarray
+    ) -> _Settled:
         u = _unit(place, anchors)
         r = np.linalg.norm(place - anchors, axis=1) - distance
         together = (u @ u.T) * common
@@ -182,13 +194,13 @@ def scaled(count: int, i: np.ndarray, j: np.ndarray, distance: np.ndarray) -> np
     return vectors[:, -2:] * np.sqrt(np.maximum(values[-2:], 1e-6))
 
 
-def _descend(starts, time, anchors, distance, sigma, walk: float) -> tuple[np.ndarray, np.ndarray]:
+def _descend(starts: np.ndarray, to: _Ranges, walk: float) -> tuple[np.ndarray, np.ndarray]:
     """States (S, 4) of place and velocity after Gauss-Newton from places (S, 2) at once, and their costs (S,)."""
     states = np.column_stack([starts, np.zeros_like(starts)])
     prior = np.array([0.0, 0.0, walk**-2, walk**-2])
     cost = np.zeros(len(states))
     for move_number in range(_MOVES + 1):
-        r, J = _linearise(states, time, anchors, distance, sigma)
+        r, J = _linearise(states, to)
         cost = 0.5 * (r**2).sum(1) + 0.5 * (prior * states**2).sum(1)
         if move_number == _MOVES:
             break
@@ -198,17 +210,17 @@ def _descend(starts, time, anchors, distance, sigma, walk: float) -> tuple[np.nd
     return states, cost
 
 
-def _linearise(states, time, anchors, distance, sigma) -> tuple[np.ndarray, np.ndarray]:
+def _linearise(states: np.ndarray, to: _Ranges) -> tuple[np.ndarray, np.ndarray]:
     """Whitened residuals (S, R) and their Jacobian (S, R, 4)."""
-    u = states[:, None, :2] + time[:, None] * states[:, None, 2:] - anchors
+    u = states[:, None, :2] + to.time[:, None] * states[:, None, 2:] - to.anchors
     d = np.maximum(np.linalg.norm(u, axis=2), 1e-6)
-    r, scale = soften((d - distance) / sigma)
-    J = (scale / sigma / d)[..., None] * u
-    return r, np.concatenate([J, time[:, None] * J], axis=2)
+    r, scale = soften((d - to.distance) / to.sigma)
+    J = (scale / to.sigma / d)[..., None] * u
+    return r, np.concatenate([J, to.time[:, None] * J], axis=2)
 
 
-def _spot(state, cost: float, time, anchors, distance, sigma, walk: float) -> Spot:
-    _, J = _linearise(state[None], time, anchors, distance, sigma)
+def _spot(state: np.ndarray, cost: float, to: _Ranges, walk: float) -> Spot:
+    _, J = _linearise(state[None], to)
     J = J[0]
     cov = np.linalg.inv(J.T @ J + np.diag([1e-6, 1e-6, walk**-2, walk**-2]))
     # a residual depends on its anchor as on the place, with the other sign

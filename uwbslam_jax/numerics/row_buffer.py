@@ -6,6 +6,9 @@ the heap in pieces.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 
 _LEAST = 64
@@ -21,11 +24,11 @@ class Column:
         self._rows = np.empty((_LEAST, *shape), dtype)
         self._count = 0
 
-    def append(self, row) -> None:
+    def append(self, row: Any) -> None:
         """One more row at the end; a tuple where the type is structured."""
         self.extend([row])
 
-    def extend(self, rows) -> None:
+    def extend(self, rows: Sequence[Any] | np.ndarray) -> None:
         """Some more rows at the end."""
         count = self._count + len(rows)
         if count > len(self._rows):
@@ -56,8 +59,8 @@ class Column:
     def __len__(self) -> int:
         return self._count
 
-    def __getitem__(self, index):
+    def __getitem__(self, index: Any) -> Any:
         return self.values[index]
 
-    def __array__(self, dtype=None, copy=None) -> np.ndarray:
+    def __array__(self, dtype: np.typing.DTypeLike | None = None, copy: bool | None = None) -> np.ndarray:
         return np.array(self.values, dtype)

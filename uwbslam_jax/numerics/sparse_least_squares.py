@@ -203,7 +203,9 @@ def _costed(fill: Fill, x: np.ndarray, rank: np.ndarray) -> tuple[float, Dense |
 
 def _linearised(fill: Fill, x: np.ndarray, rank: np.ndarray) -> Normal | Dense:
     if len(x) <= _FEW:
-        return _costed(fill, x, rank)[1]
+        few = Dense(rank)
+        fill(x, few)
+        return few
     rows = Rows(rank)
     fill(x, rows)
     normal = rows.normal()

@@ -1,4 +1,4 @@
-"""Start-up without prior knowledge (DESIGN 1.7): where the beacons stand in the frame the robot started in.
+"""Start-up without prior knowledge: where the beacons stand in the frame the robot started in.
 
 While the step runs on LiDAR (and odometry) alone, a `Buffer` keeps keyframes and what was ranged around them.
 `solve` places the beacons in every way that may explain the ranges and says how much better the best one does.

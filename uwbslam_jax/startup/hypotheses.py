@@ -59,7 +59,8 @@ def track_sides(problem: Problem) -> list[np.ndarray]:
         mine = problem.ranges.to == b
         spots[b] = multilaterate(antenna[mine], problem.ranges.distance[mine], problem.ranges.sigma[mine])
         apart = np.linalg.norm(antenna[mine, None] - spots[b], axis=2)
-        misfit[b] = _misfit(apart - problem.ranges.distance[mine, None], problem.ranges.sigma[mine, None]).sum(0)
+        off = (apart - problem.ranges.distance[mine, None]) / problem.ranges.sigma[mine, None]
+        misfit[b] = 0.5 * (soften(off)[0] ** 2).sum(0)
     choices = _best_sides(problem, spots, misfit)
     every = np.arange(len(spots))
     return [spots[every, choice] for choice in [*choices, 1 - choices[0]]]
@@ -101,11 +102,6 @@ def _side_cost(problem: Problem, spots: np.ndarray, misfit: np.ndarray, choices:
         sigma = np.hypot(problem.pairs.sigma, _SAME_M)
         cost = cost + (np.abs(apart - problem.pairs.distance) / sigma).sum(1)
     return cost
-
-
-def _misfit(error: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """Negative log-likelihood of ranges that may be outliers."""
-    return 0.5 * soften(error / sigma)[0] ** 2
 
 
 def laid_on_track(problem: Problem) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -42,9 +42,9 @@ _LATEST = 42
 """So many of a pair's newest ranges tell how much they scatter when start-up ends."""
 
 
-def is_blind(information: np.ndarray) -> np.ndarray | np.bool_:
+def is_blind(information: np.ndarray) -> np.ndarray:
     """(...) whether scans with some information about the pose (..., 3, 3) do not tell where they are."""
-    return np.linalg.eigvalsh(information[..., :2, :2])[..., 0] < _BLIND_M**-2
+    return np.asarray(np.linalg.eigvalsh(information[..., :2, :2])[..., 0] < _BLIND_M**-2)
 
 
 def is_far(pose: np.ndarray, last: np.ndarray, elapsed: int, blind: Callable[[], bool]) -> bool:
