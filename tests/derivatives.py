@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import jax
@@ -36,15 +37,26 @@ def difference(function: Callable[[Any], jax.Array], at: Any, direction: Any, st
     return (np.asarray(ahead) - np.asarray(behind)) / (2 * step)
 
 
+@cache
 def value_and_gradient(function: Callable[..., jax.Array]) -> Callable[..., Any]:
     """Both in one compilation, the larger part of what a derivative test costs; so the compiler is not to optimise."""
-    return jax.jit(jax.value_and_grad(function), compiler_options={"xla_backend_optimization_level": 0})
+    return _unoptimised(jax.value_and_grad(function))
+
+
+@cache
+def _pushed(function: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
+    """Derivative along a direction in forward mode."""
+    return _unoptimised(lambda at, along, *rest: jax.jvp(lambda x: function(x, *rest), (at,), (along,))[1])
+
+
+def _unoptimised(function: Callable[..., Any]) -> Callable[..., Any]:
+    return jax.jit(function, compiler_options={"xla_backend_optimization_level": 0})
 
 
 def assert_gradient(
-    function: Callable[[Any], jax.Array],
+    function: Callable[..., jax.Array],
     at: Any,
-    *,
+    *rest: Any,
     rtol: float = 1e-6,
     atol: float = 1e-8,
     count: int = 6,
@@ -53,15 +65,15 @@ def assert_gradient(
 ) -> Any:
     """Reverse mode, forward mode and central differences of a scalar function agree along random directions.
 
-    The default tolerances are those of a central difference in float64 with some room. Returns the gradient.
+    The default tolerances are those of a central difference in float64 with some room. Returns the gradient by the
+    first argument. The same function is compiled once for all calls with the same shapes.
     """
-    both = value_and_gradient(function)
-    gradient = assert_reverse(both, at, rtol=rtol, atol=atol, count=count, step=step)
+    gradient = assert_reverse(value_and_gradient(function), at, *rest, rtol=rtol, atol=atol, count=count, step=step)
     if forward:
-        pushed = jax.jit(lambda d: jax.jvp(function, (at,), (d,))[1])
         for direction in directions(at, count):
             # the same derivative by two orders of summation: rounding only
-            np.testing.assert_allclose(pushed(direction), along(gradient, direction), rtol=1e-9, atol=1e-10)
+            pushed = _pushed(function)(at, direction, *rest)
+            np.testing.assert_allclose(pushed, along(gradient, direction), rtol=1e-9, atol=1e-10)
     return gradient
 
 

@@ -18,6 +18,7 @@ def test_there_are_three() -> None:
     assert [path.stem for path in PATHS] == ["01_one_step", "02_rerun_a_log", "03_tune_noise"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", PATHS, ids=lambda path: path.stem)
 def test_runs(path: Path, tmp_path: Path) -> None:
     """Their own assertions hold; a process of its own, as in a fresh kernel."""

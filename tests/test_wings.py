@@ -84,7 +84,7 @@ def exports(wing: str) -> set[str]:
     """Public names of a wing: what its `__init__` imports under their own names."""
     tree = ast.parse((PACKAGE / wing / "__init__.py").read_text(encoding="utf-8"))
     aliases = [alias for node in tree.body if isinstance(node, ast.ImportFrom) for alias in node.names]
-    return {alias.asname for alias in aliases if alias.asname == alias.name and not alias.name.startswith("_")}
+    return {alias.name for alias in aliases if alias.asname == alias.name and not alias.name.startswith("_")}
 
 
 def crossing(found: list[tuple[str, str | None]], wing: str | None) -> tuple[set[str], list[str]]:

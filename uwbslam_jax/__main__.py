@@ -1,6 +1,6 @@
 """The command line: finds the command, runs it, and turns what goes wrong into one line and an exit status.
 
-The commands are in `commands`; it is imported only once one is called, because JAX takes a second to load.
+The commands are in `cli.commands`; it is imported only once one is called, because JAX takes a second to load.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import difflib
 import os
 import sys
 from collections.abc import Sequence
+from types import ModuleType
 
 from uwbslam_jax import __version__
 from uwbslam_jax.errors import UwbslamError
@@ -20,13 +21,13 @@ COMMANDS = {
     "live": "run on LiDAR and UWB devices, with a view in the browser",
     "simulate": "write a recording of a ready-made scenario, with ground truth",
     "evaluate": "compare a run's folder with ground truth",
-    "inspect": "tell what a recording holds",
+    "inspect": "show what a recording holds",
     "emulate": "serve a simulated robot's sensors, to try live without hardware",
 }
-"""Name -> what it does, in a line."""
+"""What a command does, in a line [name -> text]."""
 
-BAD_INPUT = 2
-INTERRUPTED = 130
+BAD_INPUT, INTERRUPTED = 2, 130
+"""Exit statuses [number]: what most programs return for bad usage, and 128 + SIGINT, as a shell reports it."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -51,18 +52,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return INTERRUPTED
 
 
-def _guarded(commands, words: list[str]) -> int:
+def _guarded(commands: ModuleType, words: list[str]) -> int:
     try:
         commands.call(words[0], words[1:])
-    except BrokenPipeError:  # whoever reads our output has seen enough
+    except BrokenPipeError:  # the reader of our output has closed it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (UwbslamError, OSError) as error:
-        return _fail(f"{error.filename}: {error.strerror}" if _names_file(error) else str(error))
+        if isinstance(error, OSError) and error.filename is not None and error.strerror is not None:
+            return _fail(f"{error.filename}: {error.strerror}")
+        return _fail(str(error))
     return 0
-
-
-def _names_file(error: BaseException) -> bool:
-    return isinstance(error, OSError) and error.filename is not None and error.strerror is not None
 
 
 def _fail(text: str) -> int:
@@ -74,7 +73,7 @@ def usage() -> str:
     """The help of the whole program."""
     lines = [f"  {name:<10} {about}" for name, about in COMMANDS.items()]
     head = "usage: uwbslam COMMAND ...\n\nSLAM from LiDAR scans and UWB ranges, without prior knowledge.\n"
-    return "\n".join([head, "commands:", *lines, "", "uwbslam COMMAND --help tells a command's options."])
+    return "\n".join([head, "commands:", *lines, "", "uwbslam COMMAND --help lists a command's options."])
 
 
 if __name__ == "__main__":

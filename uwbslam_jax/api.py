@@ -13,9 +13,9 @@ import zipfile
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeGuard, cast
 
-from uwbslam_jax import evaluation, result as data, tuning
+from uwbslam_jax import evaluation, result as data
 from uwbslam_jax.errors import LogError, UsageError
 from uwbslam_jax.estimator import CompileClock
 from uwbslam_jax.evaluation import Truth
@@ -25,7 +25,7 @@ from uwbslam_jax.result import MapImage, RunStatus
 from uwbslam_jax.session import PEEK_SCANS, Facts, Runner, Saved, Update, fit_beams, saved_state
 from uwbslam_jax.settings import Settings
 from uwbslam_jax.simulation import Simulation
-from uwbslam_jax.tuning import Rollout, Tuned
+from uwbslam_jax.tuning import Log, Rollout, Tuned, prepare, tune as tune_logs
 from uwbslam_jax.web import write_report
 
 Paths = str | Path | Sequence[str | Path]
@@ -292,12 +292,12 @@ def evaluate(estimate: Result | str | Path, truth: Truth | str | Path) -> dict[s
       RunError, LogError, UsageError: a file that cannot be used.
     """
     truth = truth if isinstance(truth, Truth) else load_truth(Path(truth))
-    if isinstance(estimate, data.Result):
+    if isinstance(estimate, Result):
         beacons = {beacon.id: beacon.position for beacon in estimate.beacons}
-    else:
-        estimate = read_run(estimate)
-        beacons = dict(zip(estimate.beacon_ids.tolist(), estimate.beacons, strict=True))
-    return evaluation.evaluate(estimate.stamps, estimate.poses, beacons, truth)
+        return evaluation.evaluate(estimate.stamps, estimate.poses, beacons, truth)
+    run = read_run(estimate)
+    beacons = dict(zip(run.beacon_ids.tolist(), run.beacons, strict=True))
+    return evaluation.evaluate(run.stamps, run.poses, beacons, truth)
 
 
 def load_truth(path: Path) -> Truth:
@@ -336,16 +336,16 @@ def tune(
       ConfigError: a name is unknown or a setting out of range. LogError: see `run`. RolloutError: start-up decides
         nothing, too few frames follow, or there is no truth to tune for.
     """
-    many = isinstance(recordings, Sequence) and not isinstance(recordings, str) and not _are_messages(recordings)
+    one = isinstance(recordings, str | Path | LogReader | Simulation) or _are_messages(recordings)
     logs = []
-    for source in recordings if many else [recordings]:
+    for source in cast(Sequence[Source], [recordings] if one else recordings):
         messages, settings = _opened(source, settings)
         name = messages.name if isinstance(messages, LogReader) else f"recording {len(logs) + 1}"
         kept = list(messages)
         truths = [m for m in kept if isinstance(m, TruthMessage)]
         known = any(m.node is None for m in truths)
-        logs.append(tuning.Log(name, kept, Truth.from_messages(truths) if known else None))
-    return tuning.tune(logs, tuple(params), settings_file.check(settings or Settings()), objective, progress)
+        logs.append(Log(name, kept, Truth.from_messages(truths) if known else None))
+    return tune_logs(logs, tuple(params), settings_file.check(settings or Settings()), objective, progress)
 
 
 def rollout(source: Source, settings: Settings | None = None) -> Rollout:
@@ -355,10 +355,10 @@ def rollout(source: Source, settings: Settings | None = None) -> Rollout:
       LogError: see `run`. RolloutError: start-up decides nothing, or too few frames follow.
     """
     messages, settings = _opened(source, settings)
-    return tuning.prepare(list(messages), settings)
+    return prepare(list(messages), settings)
 
 
-def _are_messages(source: object) -> bool:
+def _are_messages(source: object) -> TypeGuard[Sequence[Message]]:
     return isinstance(source, Sequence) and len(source) > 0 and isinstance(source[0], Message)
 
 
@@ -370,7 +370,7 @@ def _opened(source: Source, settings: Settings | None) -> tuple[LogReader | Iter
     if isinstance(source, LogReader | Simulation) or _are_messages(source):
         return source, settings
     if isinstance(source, str | Path | Sequence):
-        return read(source, settings), settings
+        return read(cast(Paths, source), settings), settings
     return list(source), settings
 
 

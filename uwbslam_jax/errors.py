@@ -1,4 +1,4 @@
-"""What a user can mend: one base of all errors. Each message is one line that says what and where.
+"""What a user can repair: one base of all errors. Each message is one line that says what and where.
 
 Anything else that is raised is a defect of this program.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 
 class UwbslamError(Exception):
-    """Base of all errors that a user can mend."""
+    """Base of all errors that a user can repair."""
 
 
 class ConfigError(UwbslamError, ValueError):

@@ -14,20 +14,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from uwbslam_jax.measurements import TruthMessage
-from uwbslam_jax.numerics import Column
+from uwbslam_jax.measurements import NAN, TruthMessage
+from uwbslam_jax.numerics import Column, rigid_fit as fit_pose, rotation_matrix, wrapped
 from uwbslam_jax.result import Result
 
-NAN = float("nan")
-
-# The joint fit of robot and beacons: about this many poses, evenly, each beacon counting as much as this many poses.
-FIT_POSES = 400
-BEACON_WEIGHT = 20.0
-
-
+FIT_POSES, BEACON_WEIGHT = 400, 20.0
+"""The joint fit takes about 400 poses, evenly, and a beacon as 20 of them [poses]: five weigh a quarter of it."""
 TRUTH = np.dtype([("stamp", np.int64), ("node", np.int64), ("pose", np.float64, 3)])
 """A message of the ground truth: stamp [ns], node's id or ROBOT, pose [m, m, rad]; a run of hours has very many."""
 ROBOT = -1
+"""Stands for the robot among node ids [id], which are not negative."""
 
 
 def truth_row(message: TruthMessage) -> tuple[int, int, tuple[float, float, float]]:
@@ -152,23 +148,10 @@ def rigid_fit(
 ) -> RigidMotion:
     """The rotation and translation with the least weighted sum of |R points + t - onto|^2 (Kabsch; Umeyama 1991).
 
-    The determinant of R is +1 whatever the points: where a reflection fits better, this is the best rotation.
+    The determinant of R is +1 whatever the points, see `numerics.rigid_fit`.
     """
-    w = np.ones(len(points)) if weights is None else weights
-    mean_a, mean_b = np.average(points, axis=0, weights=w), np.average(onto, axis=0, weights=w)
-    # In the plane the best angle has a closed form: the direction of sum w conj(a) b as complex numbers.
-    a, b = points - mean_a, onto - mean_b
-    along = np.sum(w * (a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1]))
-    across = np.sum(w * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]))
-    angle = np.arctan2(across, along)
-    c, s = np.cos(angle), np.sin(angle)
-    R = np.array([[c, -s], [s, c]])
-    return RigidMotion(R, mean_b - R @ mean_a)
-
-
-def wrap(angle: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    """The same angles in [-pi, pi) [rad]."""
-    return (angle + np.pi) % (2 * np.pi) - np.pi
+    pose = fit_pose(points, onto, weights)
+    return RigidMotion(rotation_matrix(pose[2]), pose[:2])
 
 
 def align(
@@ -223,7 +206,7 @@ def evaluate(
     motion = align(stamps, poses, placed, truth)
     true, moved = truth.poses_at(stamps), motion.poses(poses)
     off = np.linalg.norm(moved[:, :2] - true[:, :2], axis=1)
-    turned = np.rad2deg(np.abs(wrap(moved[:, 2] - true[:, 2])))
+    turned = np.rad2deg(np.abs(wrapped(moved[:, 2] - true[:, 2])))
     figures |= {
         "robot_rmse_m": float(np.sqrt(np.mean(off**2))),
         "robot_ate_m": absolute_trajectory_error(poses[:, :2], true[:, :2]),
@@ -308,7 +291,7 @@ def consistency(result: Result, truth: Truth) -> dict[str, float]:
         true = truth.poses_at(result.stamps[known])
         xy = (true[:, :2] - into.translation) @ into.rotation
         errors = result.online[known] - np.column_stack([xy, true[:, 2] - into.angle])
-        errors[:, 2] = wrap(errors[:, 2])
+        errors[:, 2] = wrapped(errors[:, 2])
         figures["pose_nees_ratio"] = nees(errors, result.online_covs[known]).ratio
     last = truth.beacon_positions()
     total, dof = 0.0, 0

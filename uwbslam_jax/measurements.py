@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 NAN = float("nan")
+"""What a device does not report [in any unit]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,11 +159,11 @@ class Frame(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class StampedFrame:
-    """A frame with the time that float32 cannot hold [ns] and whether a scan was taken then."""
+    """A frame with the time that float32 cannot hold [ns], and the slots of the nodes known then, by id."""
 
     stamp: int
     frame: Frame
-    slots: dict[int, int] = field(default_factory=dict)  # node id -> slot, as known at this frame
+    slots: dict[int, int] = field(default_factory=dict)
 
 
 def empty_frame(beams: int, ranges: int) -> Frame:

@@ -14,6 +14,7 @@ from uwbslam_jax.numerics import transform_points
 from uwbslam_jax.result import MapImage, Result, trinary
 
 TRACK, BEACON, END = "tab:blue", "tab:red", "tab:green"
+"""Colors of track, beacons and the track's end [matplotlib's names]: distinct on a gray map."""
 
 
 def show_map(axes: Any, image: MapImage) -> None:
@@ -56,7 +57,7 @@ def lidar_surface(
     """LiDAR term of the paper's eq. (opt), half the sum of (1 - Gamma)^2, on a level of the pyramid, the pose moved
     by offsets in y (rows) and x (columns) [m]."""
 
-    def term(dx, dy):
+    def term(dx: Float[Array, ""], dy: Float[Array, ""]) -> Float[Array, ""]:
         ends = transform_points(pose + jnp.stack([dx, dy, jnp.zeros(())]), sweep.points)
         gamma = occupancy.lookup(grid, ends, resolution, level)
         return 0.5 * jnp.sum(jnp.where(sweep.valid, (1.0 - gamma) ** 2, 0.0))

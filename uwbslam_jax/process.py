@@ -8,10 +8,9 @@ import sys
 import warnings
 from pathlib import Path
 
-_ARENA_MAX = -8
-"""Number of the parameter in malloc.h."""
-_ARENAS = 2
-"""Heaps for all threads: one for the loop that steps, one for what runs beside it."""
+_ARENA_MAX, _ARENAS = -8, 2
+"""Number of the parameter in glibc's malloc.h; heaps for all threads: one for the loop that steps, one for what runs
+beside it [heaps]."""
 
 
 def prepare() -> None:
@@ -22,7 +21,7 @@ def prepare() -> None:
     threads round differently. Memory is allocated from a few heaps. Warns where JAX is at work already.
     """
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "uwbslam_jax" / "jax"
-    told = "OPENBLAS_NUM_THREADS" in os.environ
+    chosen = "OPENBLAS_NUM_THREADS" in os.environ
     wanted = {
         "JAX_COMPILATION_CACHE_DIR": str(cache),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.2",
@@ -34,7 +33,7 @@ def prepare() -> None:
     missing = {name for name in wanted if name not in os.environ}
     for name, value in wanted.items():
         os.environ.setdefault(name, value)
-    if "numpy" in sys.modules and not told:  # it has read the variable already
+    if "numpy" in sys.modules and not chosen:  # it has read the variable already
         import threadpoolctl
 
         threadpoolctl.threadpool_limits(1, user_api="blas")
@@ -44,7 +43,7 @@ def prepare() -> None:
 
 
 def _catch_up(missing: set[str]) -> None:
-    """What JAX would have read of the variables, told to it after its import."""
+    """Sets in JAX what it would have read of the variables before its import."""
     import jax
 
     if "JAX_COMPILATION_CACHE_DIR" in missing:

@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 
 OCCUPIED_THRESHOLD = 0.65
+"""Probability from which a cell is a wall [1]: map_server's default."""
 _OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205
+"""Gray values of map_server's trinary maps [0 to 255]."""
 
 
 class RunStatus(StrEnum):
@@ -39,7 +41,7 @@ class BeaconStatus(StrEnum):
 
 
 class EventKind(Enum):
-    """What happened in a run; the value is the sentence that tells it, {} stands for an event's detail."""
+    """What happened in a run; the value is its sentence, {} stands for an event's detail."""
 
     STATUS = "{}"
     FRAME_DECIDED = "frame decided by beacons {}"
@@ -123,7 +125,7 @@ class Result:
 
     Attributes:
       stamps: (T,) int64 [ns].
-      poses: (T, 3) x, y, yaw as the whole run tells them [m, m, rad].
+      poses: (T, 3) x, y, yaw as estimated from the whole run [m, m, rad].
       online: (T, 3) as they were published along the way; those from before the frame was decided were filled in then.
       online_covs: (T, 3, 3) of these [m, m, rad].
       beacons: last estimate of every beacon ever placed.
@@ -133,7 +135,7 @@ class Result:
       scan_points: last scan in the published frame (n, 2) [m].
       diagnostics: name -> (T,) array, one value a frame (match score, hypotheses, searches, ranges used ...).
       events: of start-up and beacon life.
-      summary: the content of summary.json (see DESIGN: steps, duration_s, ...), without evaluation figures.
+      summary: the content of summary.json (docs/formats.md), without evaluation figures.
     """
 
     stamps: np.ndarray

@@ -7,7 +7,7 @@ it may be a static argument of a jitted function. Params are the differentiable 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +15,8 @@ from jaxtyping import Array, Bool, Float
 
 from uwbslam_jax.measurements import Ranges
 
-Metres = TypeVar("Metres", float, np.ndarray)
+Metres = Any
+"""A float, or an array of several [m]."""
 Slot = int | np.ndarray
 
 
@@ -103,11 +104,11 @@ class HostParams:
         """Distance of two antennas in space [m] for a range measured between slots, or for several."""
         return (measured - self.bias[i] - self.bias[j]) / (1.0 + self.bias_scale)
 
-    def rise(self, i: Slot, j: Slot) -> float | np.ndarray:
+    def rise(self, i: Slot, j: Slot) -> Metres:
         """How much higher the antenna of a slot stands than that of another [m]."""
         return self.height[i] - self.height[j]
 
-    def flat(self, measured: Metres, i: Slot, j: Slot) -> float | np.ndarray:
+    def flat(self, measured: Metres, i: Slot, j: Slot) -> Metres:
         """Distance in the plane [m]; at least 0.1, however short the range is."""
         return np.sqrt(np.maximum(self.slant(measured, i, j) ** 2 - self.rise(i, j) ** 2, 0.01))
 
@@ -199,7 +200,7 @@ class FilterSettings:
     """The estimator."""
 
     preset: Literal["robust", "paper"] = "robust"
-    """robust: everything. paper: the paper as printed with its errata mended."""
+    """robust: everything. paper: the paper as printed with its errata corrected."""
     scan_matching: bool = True
     """Paper's case: without it the map is drawn at the UWB pose."""
     correction: bool = True

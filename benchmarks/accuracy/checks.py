@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from uwbslam_jax.evaluation import wrap
+from uwbslam_jax.numerics import wrapped
 from uwbslam_jax.sim import Interval
 
 NAN = float("nan")
@@ -92,7 +92,7 @@ def largest_jump(trial: Trial) -> float:
 
 def time_lost(trial: Trial, since: float) -> float:
     """How long after `since` [s] the robot last did not know where it is [s]; 0 where it always did."""
-    turned = np.abs(wrap(trial.poses[:, 2] - trial.true[:, 2]))
+    turned = np.abs(wrapped(trial.poses[:, 2] - trial.true[:, 2]))
     known = (np.linalg.norm(trial.offset, axis=1) <= _LOST[0]) & (turned <= _LOST[1])
     lost = trial.t[(trial.t >= since) & ~known]
     return float(lost[-1] - since) if len(lost) else 0.0 if np.any(trial.t >= since) else NAN

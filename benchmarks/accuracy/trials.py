@@ -16,7 +16,8 @@ from benchmarks.accuracy.checks import NAN, Trial, rms_outside
 from benchmarks.accuracy.intervals import disturbed
 from benchmarks.accuracy.sharpness import occupied, own_fit, sharpness, stray, wall_distances
 from benchmarks.accuracy.suite import Check
-from uwbslam_jax.evaluation import RigidMotion, align, consistency, evaluate, wrap
+from uwbslam_jax.evaluation import RigidMotion, align, consistency, evaluate
+from uwbslam_jax.numerics import wrapped
 from uwbslam_jax.sim import START_NS, Scenario
 
 
@@ -75,7 +76,7 @@ def measure(scenario: Scenario, settings: us.Settings | None = None) -> Outcome:
     of_all = evaluate(result.stamps, result.poses, beacons, truth)
     true = truth.beacon_positions()
     off = [np.linalg.norm(motion.points(xy[None])[0] - true[node]) for node, xy in beacons.items() if node in true]
-    turned = np.abs(wrap(whole.poses[calm, 2] - whole.true[calm, 2]))
+    turned = np.abs(wrapped(whole.poses[calm, 2] - whole.true[calm, 2]))
     figures: dict[str, Any] = {key: of_all[key] for key in ("covered", "beacons_missing")}
     figures |= {
         "robot_rmse_m": rms_outside(whole, apart),

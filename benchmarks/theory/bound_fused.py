@@ -10,7 +10,8 @@ import uwbslam_jax as us
 from benchmarks.metric import Metric
 from benchmarks.theory.bound_recursion import recursion
 from uwbslam_jax.estimator import match_fusion
-from uwbslam_jax.evaluation import align, wrap
+from uwbslam_jax.evaluation import align
+from uwbslam_jax.numerics import wrapped
 from uwbslam_jax.sim import Scenario, strike
 
 _FIRST_SEED, _SECONDS = 500, 60.0
@@ -87,7 +88,7 @@ def _one(simulation: us.Simulation) -> list[float]:
     published = align(result.stamps[known], result.online[known], {}, truth)
     for motion, track, target in ((into, result.poses, true), (published, result.online[known], true[known])):
         apart = motion.poses(track) - target
-        found += [float(np.mean(np.sum(apart[:, :2] ** 2, axis=1))), float(np.mean(wrap(apart[:, 2]) ** 2))]
+        found += [float(np.mean(np.sum(apart[:, :2] ** 2, axis=1))), float(np.mean(wrapped(apart[:, 2]) ** 2))]
     return [*found, *_bound(simulation.scenario)]
 
 

@@ -10,7 +10,8 @@ import numpy as np
 from benchmarks.accuracy import intervals
 from benchmarks.accuracy.trials import Outcome, measure
 from uwbslam_jax import FilterSettings, MapImage, Result, Settings, simulate
-from uwbslam_jax.evaluation import rigid_fit, wrap
+from uwbslam_jax.evaluation import rigid_fit
+from uwbslam_jax.numerics import wrapped
 from uwbslam_jax.sim import Scenario, paths
 
 LENGTH = 22.7
@@ -196,7 +197,7 @@ def _seen(outcome: Outcome, made: Scenario) -> Seen:
         walls=walls,
         counted=_heard(result, made.uwb.robot_id),
         alive=alive,
-        off=np.asarray(wrap(outcome.trial.poses[:, 2] - outcome.trial.true[:, 2])),
+        off=np.asarray(wrapped(outcome.trial.poses[:, 2] - outcome.trial.true[:, 2])),
         score=np.asarray(result.diagnostics["match_score"]),
     )
 

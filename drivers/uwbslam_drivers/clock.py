@@ -12,24 +12,24 @@ import time
 from collections import deque
 
 BLOCK = 1.0
-"""Of each block of this length only the point with the least delay is kept [s]."""
+"""Of each block of this length only the point with the least delay is kept, or there were thousands [s]."""
 BLOCKS = 120
-"""Blocks of the window."""
+"""Blocks of the window: two minutes, in which a crystal's drift hardly changes [blocks]."""
 LEAST_SPAN = 10.0
-"""A shorter window tells no drift [s]."""
+"""A shorter window gives no drift: delays of milliseconds would pass for one [s]."""
 MOST_DRIFT = 1e-3
-"""No device's clock is worse than this; crystals are within 1e-4."""
+"""No device's clock is worse than this; crystals are within 1e-4 [s/s]."""
 SOONER = 0.2
-"""A device time this far ahead of the envelope is impossible [s]."""
+"""A device time this far ahead of the envelope is impossible: all data before would have been held up that long [s]."""
 EARLY = 5e-3
 """One this far ahead of it [s] may be a damaged number that its sum did not show, and moves nothing; as many as
 AGREEING in a row are the end of a delay."""
 LATER = 5.0
-"""Data does not wait longer than this [s]."""
+"""Data does not wait longer than this in any buffer on its way, so a later device time is wrong [s]."""
 AGREEING = 3
-"""As many impossible times that agree with each other mean a device that has started anew."""
+"""So many impossible times that agree with each other mean a restarted device; damaged ones do not [readings]."""
 SETTLING = 2.0
-"""The least delay is known after this time of a stream [s]."""
+"""The least delay is known after this time of a stream: tens of measurements, one of which was not held up [s]."""
 
 
 def host_time() -> int:
@@ -38,6 +38,7 @@ def host_time() -> int:
 
 
 _EPOCH = time.time_ns() - time.monotonic_ns()
+"""Epoch time of the monotonic clock's zero [ns]: read once, so that a corrected system clock steps nothing back."""
 
 
 class DeviceClock:
@@ -51,7 +52,7 @@ class DeviceClock:
     def __init__(self, wrap: int | None = None, least_delay: int = 0, reference: tuple[int, int] | None = None):
         """Args:
         wrap: period after which the device's clock starts again [ns].
-        least_delay: from a measurement to its arrival [ns]; the envelope cannot tell it from an offset.
+        least_delay: from a measurement to its arrival [ns]; the envelope does not distinguish it from an offset.
         reference: device and host time of one moment [ns, ns]; the least delay is then measured with it.
         """
         self.restarts = 0
@@ -82,7 +83,7 @@ class DeviceClock:
         """
         zero = self._begin((device, received)) if self._zero is None else self._zero
         late, x = self._point(zero, device, received)
-        # Delays count from the envelope; until there is one, only a reference tells what is possible.
+        # Delays count from the envelope; until there is one, only a reference says what is possible.
         if not -SOONER < late - self._envelope(x) < LATER:
             return self._doubt(device, received)
         self._strange.clear()
@@ -122,7 +123,7 @@ class DeviceClock:
             self._strange = [(device, received)]
         if len(self._strange) >= AGREEING:
             self.restarts += 1
-            # The reference belongs to the time before; the delay that it told does not change.
+            # The reference belongs to the time before; the delay measured with it does not change.
             if self._least < float("inf"):
                 self._delay = self._least
             self._reference = None

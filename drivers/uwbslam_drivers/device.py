@@ -5,14 +5,17 @@ To add a device, write one file with a class that meets `Device` and enter it in
 
 from __future__ import annotations
 
+import time
 from abc import abstractmethod
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeVar
 
 from uwbslam_jax.errors import UwbslamError
 from uwbslam_jax.measurements import RangeMessage, ScanMessage
+
+Found = TypeVar("Found")
 
 
 class DriverError(UwbslamError, ValueError):
@@ -28,7 +31,7 @@ class Measured(NamedTuple):
 
     Attributes:
       message: its stamp holds only where `device` is None; it is then host time already [ns].
-      device: time of the measurement on the device's own clock [ns], which may wrap; None where it tells none.
+      device: time of the measurement on the device's own clock [ns], which may wrap; None where it reports none.
     """
 
     message: ScanMessage | RangeMessage
@@ -71,7 +74,7 @@ class Session:
       decoder: for the bytes from now on.
       leftover: bytes of the stream that came with the last answer.
       wrap: period after which the device's clock starts again [ns]; None where it does not or there is none.
-      least_delay: the shortest time from a measurement to its arrival [ns], as far as the protocol tells it.
+      least_delay: the shortest time from a measurement to its arrival [ns], as far as the protocol says.
       reference: time on the device's clock and host time of one moment [ns, ns], from an exchange for that purpose.
     """
 
@@ -113,7 +116,30 @@ class Device(Protocol):
         Args:
           options: values of all `options`, sound ones.
           dropped: counts what the decoder throws away, by reason.
+
         Raises:
           OSError: the device does not answer (DeviceFailure) or is gone.
         """
         ...
+
+
+class SerialRadio:
+    """What UWB radios at a serial port have in common, see `Device`."""
+
+    kind = "uwb"
+    baud = 115200
+    dtr = True
+    tcp_port: int | None = None
+    silence = 5.0
+    options: Mapping[str, Option] = {}
+
+
+def read_until(port: Port, find: Callable[[bytes], Found | None], timeout: float) -> Found | None:
+    """What `find` returns for the bytes read so far (the last 64 KiB); None where it finds nothing in a time [s]."""
+    received = b""
+    until = time.monotonic() + timeout
+    while (left := until - time.monotonic()) > 0.0:
+        received = (received + port.read(left))[-65536:]
+        if (found := find(received)) is not None:
+            return found
+    return None

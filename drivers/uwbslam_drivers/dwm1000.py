@@ -15,16 +15,16 @@ import re
 from collections import Counter
 from collections.abc import Mapping
 
-from uwbslam_drivers.device import Measured, Option, Port, Session
-from uwbslam_drivers.lines import Lines
+from uwbslam_drivers.device import Measured, Port, SerialRadio, Session
+from uwbslam_drivers.lines import LineDecoder
 from uwbslam_jax.measurements import NAN, RangeMessage
 
-US = 1000
-WRAP = (1 << 32) * US
-"""Period of the board's clock [ns]."""
+US, WRAP = 1000, (1 << 32) * 1000
+"""A microsecond, and the period of the board's clock, which counts them in 32 bits [ns]."""
 PRF_CONSTANT = {16: 113.77, 64: 121.74}
-"""A of the power formulas by pulse repetition frequency [MHz -> dB]."""
+"""A of the power formulas by pulse repetition frequency [MHz -> dB] (DW1000 user manual, 4.7.1)."""
 _LINE = re.compile(rb"\$(UWB[DP]),(\d{1,10}),(\d{1,10}),(\d{1,10}),(-?\d{1,8}),([-0-9.,]*)\*([0-9A-Fa-f]{4})$")
+"""A line without its end [text]; what stands in its fields is checked after its CRC."""
 
 
 def checksum(text: bytes) -> int:
@@ -43,8 +43,9 @@ def powers(prf: int, f1: int, f2: int, f3: int, c: int, n: int) -> tuple[float, 
     Args:
       prf: pulse repetition frequency [MHz], 16 or 64.
       f1, f2, f3: FP_AMPL1, FP_AMPL2, FP_AMPL3. c: CIR_PWR. n: RXPACC.
+
     Returns:
-      NaN for what cannot be told: an unknown prf, n = 0 or no amplitude.
+      NaN for what is not known: an unknown prf, n = 0 or no amplitude.
     """
     constant = PRF_CONSTANT.get(prf, NAN)
     first, receive = f1 * f1 + f2 * f2 + f3 * f3, c << 17
@@ -55,24 +56,14 @@ def _decibel(power: int, n: int) -> float:
     return 10.0 * math.log10(power / (n * n)) if power > 0 and n > 0 else NAN
 
 
-class Dwm1000Decoder:
+class Dwm1000Decoder(LineDecoder):
     """Lines to ranges, stamped on the board's clock."""
 
-    def __init__(self, dropped: Counter[str]):
-        self._dropped = dropped
-        self._lines = Lines(dropped)
+    mark, sign = b"$UWB", b"*"
 
-    def feed(self, data: bytes, received: int) -> list[Measured]:
-        """Ranges of the lines that these bytes complete."""
-        found: list[Measured] = []
-        for line in self._lines.feed(data):
-            begin = line.rfind(b"$UWB")  # after a lost line end, the last line of several is whole
-            measured = parse(line[begin:]) if begin >= 0 else None
-            if measured is not None:
-                found.append(measured)
-            elif b"*" in line:
-                self._dropped["line: damaged"] += 1
-        return found
+    def ranges(self, line: bytes, received: int) -> list[Measured] | None:
+        measured = parse(line)
+        return None if measured is None else [measured]
 
 
 def parse(line: bytes) -> Measured | None:
@@ -103,15 +94,8 @@ def _power(word: str) -> float:
     return float(word) if word else NAN
 
 
-class Dwm1000:
+class Dwm1000(SerialRadio):
     """Sends by itself."""
-
-    kind = "uwb"
-    baud = 115200
-    dtr = True
-    tcp_port = None
-    silence = 5.0
-    options: Mapping[str, Option] = {}
 
     def start(self, port: Port, options: Mapping[str, str], dropped: Counter[str]) -> Session:
         return Session(Dwm1000Decoder(dropped), b"", WRAP)

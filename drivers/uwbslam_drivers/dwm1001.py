@@ -1,6 +1,6 @@
 """Qorvo DWM1001 modules in shell mode: the lines of `lec`, DIST,n,ANi,ID,x,y,z,distance,...,POS,x,y,z,quality.
 
-The surveyed positions that they carry are not used. The lines tell neither time nor power (DWM1001 firmware API guide,
+The surveyed positions that they carry are not used. The lines carry neither time nor power (DWM1001 firmware API guide,
 section 4, shell commands), nor the id of the module that is connected: that is the option `id`.
 """
 
@@ -11,35 +11,29 @@ import time
 from collections import Counter
 from collections.abc import Mapping
 
-from uwbslam_drivers.device import DeviceFailure, Measured, Option, Port, Session
-from uwbslam_drivers.lines import Lines
+from uwbslam_drivers.device import DeviceFailure, Measured, Option, Port, SerialRadio, Session, read_until
+from uwbslam_drivers.lines import LineDecoder
 from uwbslam_jax.measurements import RangeMessage
 
-_LISTEN = 0.6  # a module that sends already does so several times a second [s]
-_ANSWER = 1.5
+_LISTEN, _ANSWER = 0.6, 1.5
+"""Longest wait for a line of a module that sends several a second already, and for the shell's banner [s]."""
 
 
-class Dwm1001Decoder:
+class Dwm1001Decoder(LineDecoder):
     """Lines to ranges from the module that is connected; stamped with their arrival."""
+
+    mark = sign = b"DIST,"
 
     def __init__(self, own: int, dropped: Counter[str]):
         """own: node id of the module that is connected."""
+        super().__init__(dropped)
         self._own = own
-        self._dropped = dropped
-        self._lines = Lines(dropped)
 
-    def feed(self, data: bytes, received: int) -> list[Measured]:
-        """Ranges of the lines that these bytes complete."""
-        found: list[Measured] = []
-        for line in self._lines.feed(data):
-            begin = line.rfind(b"DIST,")
-            if begin >= 0:
-                ranges = parse(line[begin:])
-                if ranges is None:
-                    self._dropped["line: damaged"] += 1
-                for target, metres in ranges or []:
-                    found.append(Measured(RangeMessage(received, self._own, target, metres), None))
-        return found
+    def ranges(self, line: bytes, received: int) -> list[Measured] | None:
+        found = parse(line)
+        return (
+            None if found is None else [Measured(RangeMessage(received, self._own, *fields), None) for fields in found]
+        )
 
 
 def parse(line: bytes) -> list[tuple[int, float]] | None:
@@ -62,14 +56,9 @@ def parse(line: bytes) -> list[tuple[int, float]] | None:
         return None
 
 
-class Dwm1001:
+class Dwm1001(SerialRadio):
     """Enters the shell with two Returns and starts `lec`, unless the module sends lines already."""
 
-    kind = "uwb"
-    baud = 115200
-    dtr = True
-    tcp_port = None
-    silence = 5.0
     options: Mapping[str, Option] = {"id": Option("0", r"\d{1,9}", "a whole number")}
 
     def start(self, port: Port, options: Mapping[str, str], dropped: Counter[str]) -> Session:
@@ -87,10 +76,5 @@ class Dwm1001:
 
 
 def _hears(port: Port, word: bytes, timeout: float) -> bool:
-    heard = b""
-    until = time.monotonic() + timeout
-    while (left := until - time.monotonic()) > 0.0:
-        heard = (heard + port.read(left))[-4096:]
-        if word in heard:
-            return True
-    return False
+    """Whether a word arrives within a time [s]."""
+    return read_until(port, lambda received: word in received or None, timeout) is not None

@@ -1,6 +1,6 @@
 """Hokuyo scanners that speak SCIP 2.x, over TCP (UTM-30LX-EW, UST) and serial or USB (URG, UTM-30LX).
 
-The sensor tells its own step range, resolution and speed (PP). Its clock counts milliseconds in 24 bits; a stamp is of
+Step range, resolution and speed are those the sensor reports. Its clock counts milliseconds in 24 bits; a stamp is of
 the moment when the beam passes the rear (urg_node, getAngularTimeOffset), and the time of the first beam is reckoned
 from there. A scan with damaged blocks is kept as far as it is intact.
 """
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import re
-import time
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,19 +17,21 @@ import numpy as np
 
 from uwbslam_drivers import scip
 from uwbslam_drivers.clock import host_time
-from uwbslam_drivers.device import DeviceFailure, Measured, Option, Port, Session
+from uwbslam_drivers.device import DeviceFailure, Measured, Option, Port, Session, read_until
 from uwbslam_jax.measurements import NAN, ScanMessage
 
-MS = 1_000_000
-WRAP = (1 << 24) * MS
-"""Period of the sensor's clock [ns]."""
+MS, WRAP = 1_000_000, (1 << 24) * 1_000_000
+"""A millisecond, and the period of the sensor's clock, which counts them in 24 bits [ns] (SCIP 2.0, MD)."""
 LEAST_INTACT = 0.1
-"""A scan with a smaller share of intact beams is dropped."""
+"""A scan with a smaller share of intact beams is dropped: too few are left to be matched [dimensionless]."""
 _HEAD = re.compile(rb"99b\n([0-o]{4})([0-o])\n")
-_SLACK = 66  # a reply that has lost its end is taken for complete after so many bytes too many
-_ATTEMPTS = 8
-_ANSWER = 0.4  # a command is repeated after this time without an intact answer [s]
+"""Status 99 with its sum, then the stamp with its own [bytes]: how each scan begins (SCIP 2.0, MD)."""
+_SLACK = 66
+"""A reply that has lost its end is taken for complete after so many bytes too many: a block, its sum and LF [bytes]."""
+_ATTEMPTS, _ANSWER = 8, 0.4
+"""How often a command is sent at most, and how long its answer is waited for [s]: bytes are lost on serial lines."""
 _FIELDS = ("DMIN", "DMAX", "ARES", "AMIN", "AMAX", "AFRT", "SCAN")
+"""Fields of PP that make a `Specification` [mm, mm, steps a turn, steps, steps, steps, turns a minute] (SCIP 2.0)."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,7 @@ class Specification:
 
 
 UTM_30LX_EW = Specification(first=0, last=1080, front=540, per_turn=1440, nearest=23, farthest=60000, speed=2400)
+"""What a UTM-30LX-EW answers to PP [steps, mm, turns a minute]: what emulator and tests take for a sensor."""
 
 
 def parse_specification(lines: Mapping[str, str]) -> Specification | None:
@@ -102,9 +104,7 @@ class HokuyoDecoder:
         self._buffer += data
         found = []
         while (taken := self._take()) is not None:
-            text, body = taken
-            scan = self._scan(text, body)
-            if scan is not None:
+            if (scan := self._scan(*taken)) is not None:
                 found.append(scan)
         return found
 
@@ -143,10 +143,9 @@ class HokuyoDecoder:
         hit = values >= max(spec.nearest, 1)
         ranges = np.where(good, np.where(hit, values * np.float32(1e-3), np.inf), NAN).astype(np.float32)
         limits = (spec.nearest / 1e3, spec.farthest / 1e3)
-        turn = spec.turn
-        first_beam = round((spec.angle_min + math.pi) / (2.0 * math.pi) * turn * 1e9)
+        first_beam = round((spec.angle_min + math.pi) / (2.0 * math.pi) * spec.turn * 1e9)
         device = scip.decode(stamp[:4]) * MS + first_beam
-        message = ScanMessage(0, spec.angle_min, spec.increment, turn / spec.per_turn, *limits, ranges)
+        message = ScanMessage(0, spec.angle_min, spec.increment, spec.turn / spec.per_turn, *limits, ranges)
         return Measured(message, device)
 
 
@@ -180,22 +179,16 @@ def _ask(port: Port, command: bytes, attempts: int = _ATTEMPTS) -> list[bytes] |
     """Lines of the answer to a command after echo and status, None where none came."""
     for _ in range(attempts):
         port.write(command + b"\n")
-        answer = _answer(port, command)
+        answer = read_until(port, lambda received: _answer(received, command), _ANSWER)
         if answer is not None:
             return answer
     return None
 
 
-def _answer(port: Port, command: bytes) -> list[bytes] | None:
-    heard = b""
-    until = time.monotonic() + _ANSWER
-    while (left := until - time.monotonic()) > 0.0:
-        heard = (heard + port.read(left))[-65536:]
-        begin = heard.find(command + b"\n")
-        end = heard.find(b"\n\n", begin)
-        if begin >= 0 and end >= 0:
-            return [line for line in heard[begin:end].split(b"\n")[2:] if line]
-    return None
+def _answer(received: bytes, command: bytes) -> list[bytes] | None:
+    begin = received.find(command + b"\n")
+    end = received.find(b"\n\n", begin)
+    return [line for line in received[begin:end].split(b"\n")[2:] if line] if min(begin, end) >= 0 else None
 
 
 def _fields(lines: list[bytes]) -> dict[str, str]:

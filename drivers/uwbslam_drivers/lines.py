@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import Counter
 
+from uwbslam_drivers.device import Measured
+
 LONGEST = 1024
-"""A longer line is noise [bytes]."""
+"""A longer line is noise [bytes]: 32 ranges of a Makerfabs tag, the most a radio reports in one, take about 600."""
 
 
 class Lines:
@@ -29,3 +32,34 @@ class Lines:
         if len(self._open) > LONGEST:
             self._overlong, self._open = True, b""
         return found
+
+
+class LineDecoder(ABC):
+    """A decoder of lines, each read from its last `mark` on: where a line end was lost, the last line is whole.
+
+    Attributes:
+      sign: in a line that holds it and is not a measurement, something was damaged.
+    """
+
+    mark: bytes
+    sign: bytes
+
+    def __init__(self, dropped: Counter[str]):
+        self._dropped = dropped
+        self._lines = Lines(dropped)
+
+    def feed(self, data: bytes, received: int) -> list[Measured]:
+        """Ranges of the lines that these bytes complete."""
+        found: list[Measured] = []
+        for line in self._lines.feed(data):
+            begin = line.rfind(self.mark)
+            ranges = self.ranges(line[begin:], received) if begin >= 0 else None
+            if ranges is not None:
+                found += ranges
+            elif self.sign in line:
+                self._dropped["line: damaged"] += 1
+        return found
+
+    @abstractmethod
+    def ranges(self, line: bytes, received: int) -> list[Measured] | None:
+        """Ranges of a line that arrived at a host time [ns]; None where it is damaged."""

@@ -1,7 +1,7 @@
 """Nooploop LinkTrack, NodeFrame2 (55 04) and NodeFrame3 (55 05) of the NLink protocol.
 
 Little-endian; a frame ends with the sum of its bytes. Distances are 24-bit millimetres, powers minus half a byte in
-dBm (NLink protocol, LinkTrack user manual V2). NodeFrame2 tells the time of each range, NodeFrame3 one for all.
+dBm (NLink protocol, LinkTrack user manual V2). NodeFrame2 gives a time for each range, NodeFrame3 one for all.
 """
 
 from __future__ import annotations
@@ -10,17 +10,17 @@ import struct
 from collections import Counter
 from collections.abc import Mapping
 
-from uwbslam_drivers.device import Measured, Option, Port, Session
+from uwbslam_drivers.device import Measured, Port, SerialRadio, Session
 from uwbslam_jax.measurements import RangeMessage
 
-MS = 1_000_000
-WRAP = (1 << 32) * MS
-"""Period of the system time [ns]."""
+MS, WRAP = 1_000_000, (1 << 32) * 1_000_000
+"""A millisecond, and the period of the system time, which counts them in 32 bits [ns]."""
 FRAME2, FRAME3 = b"\x55\x04", b"\x55\x05"
+"""Frame header and function mark that a frame begins with [bytes] (NLink protocol)."""
 FIXED2, FIXED3 = 119, 21
-"""Bytes before the nodes."""
+"""Length of a frame before its nodes, of which the last byte is their number [bytes] (NLink protocol)."""
 NODE2, NODE3 = struct.Struct("<BB3sBBI2x"), struct.Struct("<BB3sBB")
-LONGEST = FIXED2 + 255 * NODE2.size + 1
+"""Role, id, distance [mm], powers [-0.5 dBm] and, in NodeFrame2, system time [ms] of a node (NLink protocol)."""
 
 
 class LinkTrackDecoder:
@@ -59,14 +59,14 @@ def _begin(buffer: bytes, at: int) -> int:
 
 
 def _frame_length(buffer: bytes, at: int) -> int | None:
-    """Length that the frame tells of itself, None where it is impossible or contradicts its number of nodes."""
+    """Length in the frame's own field, None where it is impossible or contradicts its number of nodes [bytes]."""
     fixed, size = (FIXED2, NODE2.size) if buffer[at + 1] == FRAME2[1] else (FIXED3, NODE3.size)
     length = buffer[at + 2] | buffer[at + 3] << 8
     count, rest = divmod(length - fixed - 1, size)
     if rest or not 0 <= count <= 255:
         return None
-    told = at + fixed - 1
-    return length if told >= len(buffer) or buffer[told] == count else None
+    number = at + fixed - 1
+    return length if number >= len(buffer) or buffer[number] == count else None
 
 
 def _ranges(frame: bytes) -> list[Measured]:
@@ -85,15 +85,10 @@ def _ranges(frame: bytes) -> list[Measured]:
     return found
 
 
-class LinkTrack:
+class LinkTrack(SerialRadio):
     """Sends by itself what it was set up for (NodeFrame2 or NodeFrame3 in NAssistant)."""
 
-    kind = "uwb"
     baud = 921600
-    dtr = True
-    tcp_port = None
-    silence = 5.0
-    options: Mapping[str, Option] = {}
 
     def start(self, port: Port, options: Mapping[str, str], dropped: Counter[str]) -> Session:
         return Session(LinkTrackDecoder(dropped), b"", WRAP)

@@ -1,7 +1,7 @@
 """Makerfabs MaUWB (ESP32 with AT firmware): AT+RANGE=tid:0,mask:01,seq:65,range:(92,0,..),rssi:(..),ancid:(0,-1,..).
 
 Ranges are in centimetres, one for each bit of the mask; newer firmware names the anchors (ancid), older counts them.
-Lines tell no time.
+Lines carry no time.
 """
 
 from __future__ import annotations
@@ -11,36 +11,26 @@ import re
 from collections import Counter
 from collections.abc import Mapping
 
-from uwbslam_drivers.device import Measured, Option, Port, Session
-from uwbslam_drivers.lines import Lines
+from uwbslam_drivers.device import Measured, Port, SerialRadio, Session
+from uwbslam_drivers.lines import LineDecoder
 from uwbslam_jax.measurements import NAN, RangeMessage
 
 _LINE = re.compile(
     r"AT\+RANGE=tid:(\d{1,5}),\s*mask:([0-9A-Fa-f]{1,8}),\s*seq:\s*(\d{1,5}),\s*range:\s*\(([^()]*)\)(.*)"
 )
-_RSSI = re.compile(r"rssi:\s*\(([^()]*)\)")
-_ANCHORS = re.compile(r"ancid:\s*\(([^()]*)\)")
+"""A report up to its ranges [text]; numbers are bounded, so that a damaged one stays small."""
+_RSSI, _ANCHORS = re.compile(r"rssi:\s*\(([^()]*)\)"), re.compile(r"ancid:\s*\(([^()]*)\)")
+"""Fields of a report [text]: powers and anchors may be missing, as older firmware leaves them out."""
 
 
-class MakerfabsDecoder:
+class MakerfabsDecoder(LineDecoder):
     """Lines to ranges of a tag; stamped with their arrival."""
 
-    def __init__(self, dropped: Counter[str]):
-        self._dropped = dropped
-        self._lines = Lines(dropped)
+    mark = sign = b"AT+RANGE="
 
-    def feed(self, data: bytes, received: int) -> list[Measured]:
-        """Ranges of the lines that these bytes complete."""
-        found: list[Measured] = []
-        for line in self._lines.feed(data):
-            begin = line.rfind(b"AT+RANGE=")
-            if begin >= 0:
-                ranges = parse(line[begin:])
-                if ranges is None:
-                    self._dropped["line: damaged"] += 1
-                for tag, anchor, metres, power in ranges or []:
-                    found.append(Measured(RangeMessage(received, tag, anchor, metres, power), None))
-        return found
+    def ranges(self, line: bytes, received: int) -> list[Measured] | None:
+        found = parse(line)
+        return None if found is None else [Measured(RangeMessage(received, *fields), None) for fields in found]
 
 
 def parse(line: bytes) -> list[tuple[int, int, float, float]] | None:
@@ -69,15 +59,8 @@ def parse(line: bytes) -> list[tuple[int, int, float, float]] | None:
     return found
 
 
-class Makerfabs:
+class Makerfabs(SerialRadio):
     """Sends by itself once AT+SETRPT=1 is set."""
-
-    kind = "uwb"
-    baud = 115200
-    dtr = True
-    tcp_port = None
-    silence = 5.0
-    options: Mapping[str, Option] = {}
 
     def start(self, port: Port, options: Mapping[str, str], dropped: Counter[str]) -> Session:
         port.write(b"AT+SETRPT=1\r\n")

@@ -8,11 +8,11 @@ import socket
 import serial
 
 CONNECT_TIMEOUT = 2.0
-"""Time for a TCP connection to come about [s]."""
+"""Time for a TCP connection to come about [s]: TCP repeats a lost first packet after 1 s."""
 WRITE_TIMEOUT = 1.0
-"""Time for the other side to take a request [s]."""
+"""Time for the other side to take a request [s]; one that takes nothing for so long is gone."""
 CHUNK = 65536
-"""At most so many bytes are read at once."""
+"""At most so much is read at once [bytes]: several scans, so that a reader who was late catches up."""
 
 
 class TcpPort:

@@ -14,23 +14,30 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from uwbslam_drivers.device import DeviceFailure, Measured, Option, Port, Session
+from uwbslam_drivers.device import DeviceFailure, Measured, Option, Port, Session, read_until
 from uwbslam_jax.measurements import ScanMessage
 
-STOP, RESET, SCAN, EXPRESS = b"\xa5\x25", b"\xa5\x40", b"\xa5\x20", b"\xa5\x82\x05\x00\x00\x00\x00\x00\x22"
-GET_HEALTH, GET_SAMPLERATE = b"\xa5\x52", b"\xa5\x59"
-MOTOR_ON = b"\xa5\xf0\x02\x94\x02\xc1"
-"""Sets the PWM to 660 on models with an accessory board; others ignore it."""
+STOP, RESET, SCAN, GET_HEALTH, GET_SAMPLERATE = b"\xa5\x25", b"\xa5\x40", b"\xa5\x20", b"\xa5\x52", b"\xa5\x59"
+"""Requests without payload: A5 and a command [bytes] (LR001)."""
+EXPRESS, MOTOR_ON = b"\xa5\x82\x05\x00\x00\x00\x00\x00\x22", b"\xa5\xf0\x02\x94\x02\xc1"
+"""Requests with length, payload and XOR sum [bytes] (LR001). The payload of MOTOR_ON is a PWM of 660 of 1023, as in
+Slamtec's SDK; models without an accessory board ignore it."""
 SCAN_HEADER, EXPRESS_HEADER = b"\xa5\x5a\x05\x00\x00\x40\x81", b"\xa5\x5a\x54\x00\x00\x40\x82"
+"""What answers with scans begin with [bytes]: A5 5A, length of one piece with the send mode, data type (LR001)."""
 HEALTH_HEADER, RATE_HEADER = b"\xa5\x5a\x03\x00\x00\x00\x06", b"\xa5\x5a\x04\x00\x00\x00\x15"
+"""The same of the answers to GET_HEALTH and GET_SAMPLERATE [bytes]."""
 NODE, CAPSULE, SAMPLES = 5, 84, 32
+"""Length of a standard sample and of an express capsule [bytes], and samples in a capsule (LR001)."""
 RANGE_MIN, RANGE_MAX = 0.15, 40.0
-"""Limits over all models [m]; a reading of 0 is no return."""
+"""Limits over all models [m], which do not report their own; a reading of 0 is no return."""
 SWEEP = 8192
-"""More samples than in any turn; without a new turn in so many the sweep is dropped."""
+"""More samples than in any turn; without a new turn in so many the sweep is dropped [samples]."""
 LEAST_SAMPLES = 30
-_LOCK = 6  # so many nodes in a row have to look right before they are taken for nodes
+"""A turn of fewer is dropped: no model has under 200, and a line through the angles needs many [samples]."""
+_LOCK = 6
+"""So many nodes in a row must look right before they are taken for nodes: each alone has 2 check bits [samples]."""
 _ANSWER = 0.5
+"""An answer is waited for so long before the request is repeated [s]: bytes are lost on serial lines."""
 
 Sample = tuple[float, float, int]
 """Clockwise angle [deg, 0 to 360], distance [m], host time [ns]."""
@@ -246,14 +253,15 @@ def _answer(port: Port, request: bytes, header: bytes, length: int) -> tuple[byt
     """Answer of a length after its header, and what came behind it."""
     for _ in range(5):
         port.write(request)
-        heard = b""
-        until = time.monotonic() + _ANSWER
-        while (left := until - time.monotonic()) > 0.0:
-            heard = (heard + port.read(left))[-65536:]
-            at = heard.find(header)
-            if at >= 0 and len(heard) >= (end := at + len(header) + length):
-                return heard[at + len(header) : end], heard[end:]
+        if (answer := read_until(port, lambda received: _behind(received, header, length), _ANSWER)) is not None:
+            return answer
     raise DeviceFailure("no answer: not an RPLIDAR, or another baud rate (115200 or 256000)")
+
+
+def _behind(received: bytes, header: bytes, length: int) -> tuple[bytes, bytes] | None:
+    begin = received.find(header) + len(header)
+    whole = begin >= len(header) and len(received) >= begin + length
+    return (received[begin : begin + length], received[begin + length :]) if whole else None
 
 
 def _drain(port: Port, quiet: float) -> None:

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
-BLOCK = 64
-ZERO = 0x30
-_REACH = 12  # a block is looked for so many bytes to either side of where it should be
+BLOCK, ZERO = 64, 0x30
+"""Characters in a block of data, and the code of a character that stands for 0 [dimensionless] (SCIP 2.0)."""
+_REACH = 12
+"""A block is looked for so far to either side of where it should be, since bytes are lost or added [bytes]."""
 
 
 def checksum(data: bytes) -> int:
@@ -56,6 +57,7 @@ def decode_blocks(body: bytes, count: int) -> tuple[np.ndarray, np.ndarray, int]
     Args:
       body: blocks with sums and line ends, as received.
       count: how many values were asked for.
+
     Returns:
       values (count,) int32, whether each is intact (count,) bool, and the number of damaged blocks.
     """

@@ -37,14 +37,14 @@ DEVICES: dict[str, Device] = {
     "dwm1001": Dwm1001(),
     "makerfabs": Makerfabs(),
 }
-"""Every protocol by name; the first of a kind is its default."""
+"""Every protocol [name -> device]; the first of a kind is its default."""
 
 POLL = 0.1
 """A read waits no longer, so that closing is quick [s]."""
 SCANLESS = 10.0
-"""A LiDAR without an intact scan for so long is started anew [s]."""
+"""A LiDAR without an intact scan for so long is started anew: longer than a motor takes to run up [s]."""
 FIRST_WAIT, LONGEST_WAIT = 0.2, 2.0
-"""Wait before a port is tried again: doubles from the first to the longest [s]."""
+"""Wait before a port is tried again: doubles, so that a device that is absent for long costs nothing [s]."""
 
 
 class Reading(NamedTuple):
@@ -53,7 +53,7 @@ class Reading(NamedTuple):
     Attributes:
       message: stamped with the host time of the measurement [ns].
       received: host time of its arrival [ns].
-      device: time of the measurement on the device's own clock [ns]; None where it tells none.
+      device: time of the measurement on the device's own clock [ns]; None where it reports none.
     """
 
     message: ScanMessage | RangeMessage
@@ -195,10 +195,7 @@ class Source:
         finally:
             port.close()
 
-    def _readings(
-        self, decoder: Decoder, clock: DeviceClock, data: bytes, heard: int | None = None
-    ) -> Iterator[Reading]:
-        received = self._now() if heard is None else heard
+    def _readings(self, decoder: Decoder, clock: DeviceClock, data: bytes, received: int) -> Iterator[Reading]:
         self.counts["bytes"] += len(data)
         restarts = clock.restarts
         for message, device in decoder.feed(data, received):

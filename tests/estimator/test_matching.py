@@ -13,7 +13,7 @@ from derivatives import assert_gradient, double
 
 from uwbslam_jax.estimator import matching
 from uwbslam_jax.mapping import grid as occupancy
-from uwbslam_jax.mapping.sweep import undo_motion
+from uwbslam_jax.mapping.sweep import find_surface, undo_motion
 from uwbslam_jax.numerics.gaussian import Gaussian
 
 CELLS, LEVELS, RESOLUTION, BEAMS = 128, 3, 0.1, 180
@@ -21,7 +21,7 @@ SIGMA_L = 0.25
 
 
 def blind_direction(sweep):
-    return matching.blind_direction(sweep.surface(sweep), sweep.valid)
+    return matching.blind_direction(find_surface(sweep), sweep.valid)
 
 
 @partial(jax.jit, static_argnums=5)
@@ -31,13 +31,13 @@ def align(grid, sweep, start, prior, sigma_l, resolution):
 
 @partial(jax.jit, static_argnums=3)
 def assess(grid, sweep, pose, resolution):
-    return matching.assess(grid, sweep, sweep.surface(sweep), pose, resolution)
+    return matching.assess(grid, sweep, find_surface(sweep), pose, resolution)
 
 
 @partial(jax.jit, static_argnums=4)
 def search(grid, sweep, prior, sigma_l, resolution):
     known = (prior.mean, prior.mean)
-    return matching.search(grid, sweep, sweep.surface(sweep), prior, known, sigma_l, resolution)
+    return matching.search(grid, sweep, find_surface(sweep), prior, known, sigma_l, resolution)
 
 
 def sweep_at(pose, beams=BEAMS, walls=room.WALLS):
@@ -125,7 +125,7 @@ def test_the_end_of_a_corridor_tells_nothing_before_it_is_drawn():
 
 
 def share_of_walls(sweep, some, heading) -> np.ndarray:
-    return np.asarray(matching.share_of_walls(sweep.surface(sweep), some, sweep.valid, jnp.float32(heading)))
+    return np.asarray(matching.share_of_walls(find_surface(sweep), some, sweep.valid, jnp.float32(heading)))
 
 
 @pytest.mark.parametrize("heading", [0.0, 0.7, -2.0])

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from derivatives import assert_gradient, double
+from derivatives import assert_gradient, double, value_and_gradient
 from hypothesis import given, strategies as st
 from scipy.linalg import expm
 
@@ -206,6 +206,14 @@ def test_the_map_of_a_robot_at_rest_errs_as_before_however_long_it_stands(params
     np.testing.assert_allclose(np.diag(after.cov)[rows], 1e-4, rtol=1e-5)  # float32
 
 
+def weighted(at, params, cov, weights, measured):
+    """A sum over what is predicted, with weights, of the things by which it is to be differentiated."""
+    mean, sigma_w, dt, increment = at
+    changed = params._replace(sigma_w=sigma_w)
+    after = predict(Gaussian(mean, cov), changed, dt, Odometry(increment, measured), CARRIED, UNREST)
+    return weights @ after.mean + jnp.sum(after.cov * jnp.outer(weights, weights))
+
+
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("measured", [None, (0.3, -0.1, 0.2)], ids=["no odometry", "odometry"])
 def test_gradient_of_a_prediction_agrees_with_finite_differences(params, measured):
@@ -214,23 +222,13 @@ def test_gradient_of_a_prediction_agrees_with_finite_differences(params, measure
     root = jnp.asarray(0.1 * rng.normal(size=(SIZE, SIZE)))
     x = double(state(velocity=(0.8, 0.3), heading=0.4, yaw_rate=0.3, map_error=(0.01, 0.02, 0.003)))
     weights = jnp.asarray(rng.normal(size=SIZE))
-
-    def value(at):
-        mean, sigma_w, dt, increment = at
-        changed = params._replace(sigma_w=sigma_w)
-        odometry = Odometry(increment, jnp.array(measured is not None))
-        after = predict(Gaussian(mean, root @ root.T), changed, dt, odometry, CARRIED, UNREST)
-        return weights @ after.mean + jnp.sum(after.cov * jnp.outer(weights, weights))
-
-    increment = jnp.array(measured or (0.0, 0.0, 0.0))
-    assert_gradient(value, (x, params.sigma_w, jnp.array(0.2), increment))
+    at = (x, params.sigma_w, jnp.array(0.2), jnp.array(measured or (0.0, 0.0, 0.0)))
+    assert_gradient(weighted, at, params, root @ root.T, weights, jnp.array(measured is not None))
 
 
 @pytest.mark.usefixtures("x64")
 def test_gradient_at_rest_without_odometry_is_finite(params):
-    def value(mean):
-        belief = Gaussian(mean, jnp.eye(SIZE))
-        after = predict(belief, double(params), jnp.array(0.1), NONE, RESTING, UNREST)
-        return jnp.sum(after.mean) + jnp.sum(after.cov)
-
-    assert np.isfinite(jax.grad(value)(double(state()))).all()
+    params = double(params)
+    at = (double(state()), params.sigma_w, jnp.array(0.1), jnp.zeros(3))
+    gradient = value_and_gradient(weighted)(at, params, jnp.eye(SIZE), jnp.ones(SIZE), jnp.array(False))[1]
+    assert all(np.isfinite(leaf).all() for leaf in gradient)

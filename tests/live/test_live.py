@@ -106,6 +106,7 @@ def end_after_start_up(process: subprocess.Popen[str], folder: Path, over: threa
     process.send_signal(signal.SIGINT)
 
 
+@pytest.mark.slow
 def test_a_run_ends_with_all_files_and_says_how_late_it_was(lived: Lived) -> None:
     assert lived.status == 0
     assert {path.name for path in lived.folder.iterdir() if not path.is_symlink()} == FILES | {
@@ -123,6 +124,7 @@ def test_a_run_ends_with_all_files_and_says_how_late_it_was(lived: Lived) -> Non
     assert summary["recording"] == lived.recording.name
 
 
+@pytest.mark.slow
 def test_the_recording_gives_the_same_track_bit_for_bit(lived: Lived, tmp_path: Path) -> None:
     # in a process of its own, as a user runs it: pytest has loaded numpy by now, with LAPACK's threads, which round
     # differently from one run to the next
@@ -133,6 +135,7 @@ def test_the_recording_gives_the_same_track_bit_for_bit(lived: Lived, tmp_path: 
     assert len(read_trajectory(tmp_path / "trajectory.tum")[0]) > 100
 
 
+@pytest.mark.slow
 def test_dropped_scans_are_in_the_recording_apart(lived: Lived) -> None:
     lost = json.loads((lived.folder / "summary.json").read_text())["dropped"].get("scan: overtaken by a newer one", 0)
     apart = LogReader(lived.recording, scan_topic="/scan_dropped", uwb_topic=None)
@@ -151,6 +154,7 @@ def published(log: Path) -> tuple[np.ndarray, np.ndarray]:
     return np.array(stamps), np.array(rows)
 
 
+@pytest.mark.slow
 @needs_browser
 def test_the_page_shows_the_pose_that_was_sent(lived: Lived) -> None:
     stamps, poses = published(lived.folder / "result.mcap")
@@ -172,6 +176,7 @@ def test_the_page_shows_the_pose_that_was_sent(lived: Lived) -> None:
     assert shown >= 3
 
 
+@pytest.mark.slow
 @needs_browser
 def test_the_page_tells_of_start_up_devices_and_beacons(lived: Lived) -> None:
     assert "Waiting for motion" in lived.words["early"]
@@ -185,6 +190,7 @@ def test_the_page_tells_of_start_up_devices_and_beacons(lived: Lived) -> None:
     assert lived.console == []
 
 
+@pytest.mark.slow
 def test_localising_leaves_the_map_as_it_was(lived: Lived, tmp_path: Path) -> None:
     words = ["live", "--emulate", "workshop", "-o", str(tmp_path / "out"), "--duration", "4"]
     assert main([*words, "--localize", str(lived.folder), "--view", "off"]) == 0
@@ -195,6 +201,7 @@ def test_localising_leaves_the_map_as_it_was(lived: Lived, tmp_path: Path) -> No
     assert not (tmp_path / "out" / "state.npz").exists()
 
 
+@pytest.mark.slow
 def test_a_killed_run_has_its_recording_and_another_goes_on(lived: Lived, tmp_path: Path) -> None:
     words = [sys.executable, "-m", "uwbslam_jax", "live", "--emulate", "workshop", "-o", str(tmp_path)]
     words += ["--resume", str(lived.folder), "--view", "off"]
@@ -310,7 +317,8 @@ def test_what_a_user_can_mend_is_one_line(
 
 def test_devices_that_are_not_there_are_told_at_the_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     url = f"tcp://127.0.0.1:{free_port()}"
-    assert main(["live", "--lidar", url, "-o", str(tmp_path), "--duration", "0.5", "--view", "off"]) == 2
+    small = ["--map.size-m", "12.8", "--lidar.max-beams", "60", "--uwb.max-beacons", "3"]  # compiles faster
+    assert main(["live", "--lidar", url, "-o", str(tmp_path), "--duration", "0.5", "--view", "off", *small]) == 2
     told = capsys.readouterr().err
     assert told.count("\n") == 1
     assert f"nothing was measured: lidar ({url}) is closed" in told

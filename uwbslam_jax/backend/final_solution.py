@@ -14,7 +14,7 @@ from uwbslam_jax.backend.graph import Graph
 from uwbslam_jax.backend.range_means import Node
 from uwbslam_jax.backend.smoothing import Solution, solve
 from uwbslam_jax.estimator import frame_motion, published
-from uwbslam_jax.numerics import between, compose, numeric_jacobian, turned, wrapped
+from uwbslam_jax.numerics import between, compose, numeric_jacobian, rigid_fit, transformed, wrapped
 from uwbslam_jax.settings import HostParams
 
 
@@ -75,23 +75,16 @@ def _framed(solution: Solution, before: np.ndarray, frame_nodes: tuple[Node, Nod
         to_frame = partial(published, slots=solution.nodes, frame_slots=frame_nodes, onward=np.zeros(3))
         motion = frame_motion(solution.beacons, solution.nodes, frame_nodes)
     else:
-        motion = _fit(solution.poses, before)
+        motion = rigid_fit(solution.poses[:, :2], before[:, :2])
 
         def to_frame(x: np.ndarray) -> np.ndarray:
             beacons = x[3:].reshape(-1, 2)
-            return np.concatenate([compose(motion, x[:3]), (motion[:2] + turned(motion[2], beacons)).ravel()])
+            return np.concatenate([compose(motion, x[:3]), transformed(motion, beacons).ravel()])
 
     x = np.concatenate([solution.poses[-1], solution.beacons.ravel()])
     J = numeric_jacobian(to_frame, x)
-    beacons = motion[:2] + turned(motion[2], solution.beacons)
+    beacons = transformed(motion, solution.beacons)
     return solution._replace(poses=compose(motion, solution.poses), beacons=beacons, cov=J @ solution.cov @ J.T)
-
-
-def _fit(poses: np.ndarray, onto: np.ndarray) -> np.ndarray:
-    """(3,) the rigid motion that lays poses (N, 3) over others best."""
-    a, b = poses[:, :2] - poses[:, :2].mean(0), onto[:, :2] - onto[:, :2].mean(0)
-    theta = np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))
-    return np.append(onto[:, :2].mean(0) - turned(theta, poses[:, :2].mean(0)), theta)
 
 
 def _track(graph: Graph, after: np.ndarray, stamps: np.ndarray, poses: np.ndarray, sight: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from uwbslam_jax.backend.range_means import RangeMeans
 from uwbslam_jax.backend.registration import View, register, view
 from uwbslam_jax.estimator import Estimate, map_pose
 from uwbslam_jax.measurements import Scan, Snapshot, StampedFrame
-from uwbslam_jax.numerics import Column, between, turned, wrapped
+from uwbslam_jax.numerics import Column, between, rotation_matrix, transformed, turned, wrapped
 from uwbslam_jax.settings import HostParams
 
 _MOVED = (0.25, 0.2)
@@ -172,9 +172,7 @@ class Graph:
 
     def put(self, poses: np.ndarray, turn: float) -> None:
         """The map was drawn again: keyframes so far are at poses (N, 3) in it, turned by an angle [rad]."""
-        R = np.eye(3)
-        c, s = np.cos(turn), np.sin(turn)
-        R[:2, :2] = [[c, -s], [s, c]]
+        R = rotation_matrix(turn, 3)
         self.keyframes["pose"][:] = poses
         self.keyframes["informed"][:] = R @ self.keyframes["informed"] @ R.T
 
@@ -215,7 +213,7 @@ class Graph:
             self._wheels = np.full(3, np.nan)
         elif np.isfinite(self._wheels[0]):
             step = np.asarray(odometry.increment, float)
-            self._wheels = np.append(self._wheels[:2] + turned(self._wheels[2], step[:2]), self._wheels[2] + step[2])
+            self._wheels = np.append(transformed(self._wheels, step[:2]), self._wheels[2] + step[2])
 
     def _tie(self, host: HostParams) -> None:
         """Edges from the newest keyframe to older ones whose scans it can be laid over."""

@@ -26,7 +26,7 @@ from uwbslam_jax.numerics import (
     mean_sigma,
     minimise,
     soften,
-    turned,
+    transformed,
     wrapped,
 )
 from uwbslam_jax.settings import HostParams
@@ -285,7 +285,7 @@ class Problem:
         beacons = x[n : n + 2 * len(self.nodes)].reshape(-1, 2)
         at, to, share = self.at[part], self.to[part], self.share[part]
         levers = ((at, self.before[part]), (at + 1, self.after[part]))
-        ends = [poses[k, :2] + turned(poses[k, 2], lever) for k, lever in levers]
+        ends = [transformed(poses[k], lever) for k, lever in levers]
         antenna = (1 - share)[:, None] * ends[0] + share[:, None] * ends[1]
         u = antenna - beacons[to]
         d = np.maximum(np.sqrt((u**2).sum(1) + self.rise[part] ** 2), 1e-6)

@@ -92,7 +92,7 @@ class EvaluateOptions:
 
 @dataclass
 class InspectOptions:
-    """Tell what a recording holds: topics, rates, gaps, nodes heard, and what is missing."""
+    """Show what a recording holds: topics, rates, gaps, nodes heard, and what is missing."""
 
     logs: Positional[tuple[Path, ...]]
     """MCAP recording, or a ROS 2 bag folder; several MCAP files are one recording."""
@@ -104,20 +104,15 @@ def call(name: str, words: Sequence[str]) -> None:
     """Runs one command with its own arguments.
 
     Raises:
-      UwbslamError, OSError: what a user can mend.
+      UwbslamError, OSError: what a user can repair.
       SystemExit: bad usage (status 2), or help was asked for (0); the text is printed.
     """
     options, run = _COMMANDS[name]
-    default = None
-    if options is RunOptions:
-        default = RunOptions((), Path(), settings=_settings_file(words))
-        default.logs = default.out = tyro.MISSING  # these two have to be given all the same
-    elif options is TuneOptions:
-        default = TuneOptions((), Path(), settings=_settings_file(words))
-        default.logs = default.out = tyro.MISSING
-    elif options is LiveOptions:
-        default = LiveOptions(Path(), settings=_settings_file(words))
-        default.out = tyro.MISSING
+    default: Any = None
+    fields = {field.name: field for field in dataclasses.fields(options)}
+    if "settings" in fields:
+        required = [name for name, f in fields.items() if f.default is f.default_factory is dataclasses.MISSING]
+        default = options(**dict.fromkeys(required, tyro.MISSING), settings=_settings_file(words))
     run(tyro.cli(options, args=list(words), default=default, prog=f"uwbslam {name}", description=options.__doc__))
 
 
@@ -183,9 +178,7 @@ _COMMANDS: dict[str, tuple[Any, Callable[[Any], None]]] = {
     "live": (LiveOptions, live),
     "emulate": (EmulateOptions, emulate),
 }
-
-
-# What several commands share.
+"""Every command [name -> its options, what runs it]."""
 
 
 def _run_and_write(

@@ -29,13 +29,17 @@ from uwbslam_jax.sim import SCENARIOS, make_scenario, settings_overrides
 from uwbslam_jax.web import LivePage, LiveView, parse_address
 
 _LOOPBACK, _PUBLISH_PORT = "127.0.0.1", 8766
+"""Host of the view by default [name], which nothing outside this computer reaches, and port of the publisher [number]:
+Foxglove's own, 8765, is taken by the view."""
 _EMULATE = """\
 import ctypes, sys
 from uwbslam_jax.__main__ import main
 ctypes.CDLL(None).prctl(1, 15)  # PR_SET_PDEATHSIG: ends when we do, even if we are killed
 main(sys.argv[1:])
 """
+"""Program that runs the emulators [Python]: a process of its own, for it must not slow the run down."""
 _TRUTH = "truth.npz"
+"""Where the emulators write their truth, and the run looks for it [file in its folder]."""
 
 
 @dataclass
@@ -61,7 +65,7 @@ class LiveOptions:
     localize: Path | None = None
     """Start from map and beacons of this folder of a run and only localise: both stay as they are."""
     view: str = f"{_LOOPBACK}:8765"
-    """HOST:PORT of the live view; 'off' for none. Whoever reaches it sees the map."""
+    """HOST:PORT of the live view; 'off' for none. Everybody who can reach it sees the map."""
     publish: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Publish ROS 2 messages over a Foxglove WebSocket at port 8766 of the same host."""
     duration: float | None = None
@@ -80,7 +84,7 @@ def live(options: LiveOptions) -> None:
     devices = None if options.lidar is None else Devices(options.lidar, options.uwb)
     slam = Slam(settings, resume=options.resume, localize=options.localize, fit=False)
     options.out.mkdir(parents=True, exist_ok=True)
-    with contextlib.ExitStack() as ends, _until_told(options.duration) as go:
+    with contextlib.ExitStack() as ends, _until_stopped(options.duration) as go:
         page, publisher = _outputs(options, ends)
         if devices is None:
             devices = Devices(*ends.enter_context(_emulators(str(options.emulate), options.out)))
@@ -98,10 +102,10 @@ def live(options: LiveOptions) -> None:
     if options.emulate is not None and truth.exists() and len(result.stamps):
         result.truth = Truth.load(truth)
     deliver(result, options.out, f"UWB and LiDAR SLAM: {recording.name}")
-    print(_told(result.summary))
+    print(_losses(result.summary))
 
 
-def _told(summary: dict) -> str:
+def _losses(summary: dict) -> str:
     """Latency and losses in a line."""
     median, worst = summary["latency_ms_median"], summary["latency_ms_p99"]
     lost = ", ".join(f"{count} {why}" for why, count in summary["dropped"].items()) or "nothing"
@@ -148,19 +152,19 @@ def _outputs(options: LiveOptions, ends: contextlib.ExitStack) -> tuple[LivePage
 
 
 @contextlib.contextmanager
-def _until_told(duration: float | None) -> Iterator[Callable[[], bool]]:
+def _until_stopped(duration: float | None) -> Iterator[Callable[[], bool]]:
     """A question whether to go on: until SIGINT, SIGTERM, or a time since it was first asked [s]."""
-    told = threading.Event()
+    stopped = threading.Event()
     begin: list[float] = []
 
     def go() -> bool:
         begin[:] = begin or [time.monotonic()]
-        return not told.is_set() and (duration is None or time.monotonic() - begin[0] < duration)
+        return not stopped.is_set() and (duration is None or time.monotonic() - begin[0] < duration)
 
     before = {}
     if threading.current_thread() is threading.main_thread():
         for number in (signal.SIGINT, signal.SIGTERM):
-            before[number] = signal.signal(number, lambda *_: told.set())
+            before[number] = signal.signal(number, lambda *_: stopped.set())
     try:
         yield go
     finally:

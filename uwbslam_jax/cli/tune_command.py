@@ -51,8 +51,8 @@ def tune(options: TuneOptions) -> None:
     settings_file.save_settings(settings_file.check(tuned.settings), options.out / "tuned.toml")
     (options.out / "tuning.md").write_text(tuned.table(), encoding="utf-8")
     (options.out / "tuning.json").write_text(tuned.json(), encoding="utf-8")
-    for told in tuned.cuts():
-        print(f"warning: {told}", file=sys.stderr)
+    for cut in tuned.cuts():
+        print(f"warning: {cut}", file=sys.stderr)
     print(tuned.table())
     print(f"settings: {options.out / 'tuned.toml'}")
     left_out = "left out" + ("" if tuned.noises is None else ", without matplotlib")

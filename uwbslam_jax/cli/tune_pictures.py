@@ -12,16 +12,16 @@ import numpy as np
 
 from uwbslam_jax.tuning import NoiseFit, Objective
 
-_POINTS = 9
-_SIDE = 7
+_POINTS, _SIDE = 9, 7
+"""Points of a profile and along a side of the slice [points]: each is a rollout of all recordings."""
 _SPREADS = 3.0
-"""A profile reaches so many standard deviations to either side,"""
+"""A profile reaches so many standard deviations to either side [sigma], within which nearly all of it lies,"""
 _REACH = (0.05, 1.0)
-"""at least and at most so far in the logarithm."""
+"""at least and at most so far [in the logarithm]: a sigma of the Hessian may be tiny, or infinite."""
 _SLICED = ("gamma", "sigma_n")
-"""What the slice is through where both are tuned; else through the first two that are told."""
+"""The slice is through these where both are tuned, as they trade off [names]; else through the first two observed."""
 _WORST = 60.0
-"""Log-likelihood below the best beyond which a slice has one colour."""
+"""Log-likelihood below the best beyond which a slice has one colour [nats], or its valley would have one."""
 
 
 def draw(objective: Objective, tuned: NoiseFit, folder: Path) -> list[Path]:
@@ -33,12 +33,12 @@ def draw(objective: Objective, tuned: NoiseFit, folder: Path) -> list[Path]:
     matplotlib.use("Agg")
     from matplotlib import pyplot as plt
 
-    told = [k for k, how in enumerate(tuned.told) if how != "not observed"]
+    observed = [k for k, how in enumerate(tuned.told) if how != "not observed"]
     paths = [_save(_history(plt, tuned), folder / "loss.png")]
-    if told:
-        paths.append(_save(_profiles(plt, objective, tuned, told), folder / "profile.png"))
-    if len(told) > 1:
-        paths.append(_save(_slice(plt, objective, tuned, told), folder / "slice.png"))
+    if observed:
+        paths.append(_save(_profiles(plt, objective, tuned, observed), folder / "profile.png"))
+    if len(observed) > 1:
+        paths.append(_save(_slice(plt, objective, tuned, observed), folder / "slice.png"))
     plt.close("all")
     return paths
 
@@ -83,9 +83,9 @@ def _reach(tuned: NoiseFit, k: int) -> float:
     return float(np.clip(spread, *_REACH))
 
 
-def _profiles(plt: Any, objective: Objective, tuned: NoiseFit, told: list[int]) -> Any:
-    figure, every = plt.subplots(1, len(told), figsize=(3.4 * len(told), 3.2), squeeze=False)
-    for axes, k in zip(every[0], told, strict=True):
+def _profiles(plt: Any, objective: Objective, tuned: NoiseFit, observed: list[int]) -> Any:
+    figure, every = plt.subplots(1, len(observed), figsize=(3.4 * len(observed), 3.2), squeeze=False)
+    for axes, k in zip(every[0], observed, strict=True):
         values, worse = profile(objective, tuned, k)
         axes.plot(values, worse, "o-", label="profile")
         if np.isfinite(tuned.sigma[k]):
@@ -98,8 +98,8 @@ def _profiles(plt: Any, objective: Objective, tuned: NoiseFit, told: list[int]) 
     return figure
 
 
-def _slice(plt: Any, objective: Objective, tuned: NoiseFit, told: list[int]) -> Any:
-    first, second = told[:2]
+def _slice(plt: Any, objective: Objective, tuned: NoiseFit, observed: list[int]) -> Any:
+    first, second = observed[:2]
     if all(name in tuned.names for name in _SLICED):
         first, second = (tuned.names.index(name) for name in _SLICED)
     logs = np.log(tuned.values)

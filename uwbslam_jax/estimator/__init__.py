@@ -1,13 +1,6 @@
 """The compiled step: pure, of fixed shape, reads like the paper."""
 
-from uwbslam_jax.estimator import (
-    compiled as compiled,
-    match_fusion as match_fusion,
-    matching as matching,
-    motion as motion,
-    ranging as ranging,
-    state_vector as state_vector,
-)
+from uwbslam_jax.estimator import compiled as compiled, ranging as ranging, state_vector as state_vector
 from uwbslam_jax.estimator.compiled import CompileClock as CompileClock
 from uwbslam_jax.estimator.host_view import (
     Changes as Changes,

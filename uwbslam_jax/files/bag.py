@@ -16,7 +16,7 @@ from uwbslam_jax.errors import LogError
 from uwbslam_jax.files.mcap_container import RawMessage, Recording
 
 _MOST_CHANNELS = 1 << 16
-"""A channel's number in a file has 16 bits; the next bits tell the file."""
+"""A channel's number in a file has 16 bits; the next bits are the file's [channels]."""
 
 Source = str | Path | Sequence[str | Path]
 """A recording: an MCAP file, a bag's folder, or several of either that belong together."""
@@ -109,8 +109,8 @@ def _named(metadata: Path) -> list[str]:
     if not metadata.exists():
         return []
     try:
-        told = YAML(typ="safe").load(metadata.read_text(encoding="utf-8"))
-        names = ((told or {}).get("rosbag2_bagfile_information") or {}).get("relative_file_paths") or []
+        loaded = YAML(typ="safe").load(metadata.read_text(encoding="utf-8"))
+        names = ((loaded or {}).get("rosbag2_bagfile_information") or {}).get("relative_file_paths") or []
         return [str(name) for name in names]
     except (OSError, ValueError, AttributeError, TypeError, YAMLError) as error:
         raise LogError(f"{metadata}: {' '.join(str(error).split())}") from None

@@ -1,4 +1,4 @@
-"""What a recording holds, for a person: topics with their rates and gaps, who was heard, what is missing."""
+"""What a recording holds, for a person: topics with their rates and gaps, nodes heard, what is missing."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def inspect_log(
     robot_id: int = 0,
     max_range: float = 200.0,
 ) -> LogSummary:
-    """Reads a recording through and tells what it holds; arguments as for `LogReader`.
+    """Reads a recording through and says what it holds; arguments as for `LogReader`.
 
     Raises:
       LogError: the file cannot be read at all. Missing or ambiguous topics are `problems` of the summary.

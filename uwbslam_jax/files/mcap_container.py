@@ -30,11 +30,12 @@ from mcap.writer import Writer
 from uwbslam_jax.errors import LogError
 
 MAGIC = b"\x89MCAP0\r\n"
-PLAIN_BLOCK_BYTES = 1 << 20  # unchunked messages are read this many bytes at a time
-MAX_CHUNK_BYTES = 1 << 30  # a chunk that claims more is taken as corrupt rather than allocated
-_HEADER = struct.Struct("<BQ")
-_MESSAGE = struct.Struct("<BQHIQQ")  # record header, channel, sequence, log time, publish time
-_CHUNK = struct.Struct("<QQQII")  # first and last log time, size, crc, length of the compression's name
+"""What a file begins and ends with [bytes] (MCAP specification)."""
+PLAIN_BLOCK_BYTES, MAX_CHUNK_BYTES = 1 << 20, 1 << 30
+"""Unchunked messages are read so many at a time; a chunk that claims over 1 GiB is corrupt, not allocated [bytes]."""
+_HEADER, _MESSAGE, _CHUNK = struct.Struct("<BQ"), struct.Struct("<BQHIQQ"), struct.Struct("<QQQII")
+"""Opcode, length; the same and channel, sequence, log and publish time; a chunk's first and last log time, size, crc,
+length of the compression's name [bytes] (MCAP specification, Records)."""
 
 
 class _CorruptError(Exception):
@@ -193,11 +194,11 @@ class Recording:
 
     def _take_stock(self, file: BinaryIO, broken_at: int | None) -> None:
         """Channels, counts and times: from the summary, or by reading through where there is none."""
-        told = self._statistics
-        if broken_at is None and told and told.channel_count <= len(self.channels):
-            self.counts.update(told.channel_message_counts)
-        if told and self.counts.total() == told.message_count:
-            self.start, self.end = told.message_start_time, told.message_end_time
+        summary = self._statistics
+        if broken_at is None and summary and summary.channel_count <= len(self.channels):
+            self.counts.update(summary.channel_message_counts)
+        if summary and self.counts.total() == summary.message_count:
+            self.start, self.end = summary.message_start_time, summary.message_end_time
         else:
             self.counts.clear()
             for index, block in enumerate(self._blocks):

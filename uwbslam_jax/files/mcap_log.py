@@ -1,6 +1,6 @@
 """Messages out of and into MCAP recordings: which topic plays which role, in what order, and what was left out.
 
-How a message type is laid out is `schemas`; how the file is built is `mcap_records`; frames are made in `frames`.
+How a message type is laid out is `schemas`; how the file is built is `mcap_container`.
 """
 
 from __future__ import annotations
@@ -21,9 +21,10 @@ from uwbslam_jax.files.ros_types import definition, encode
 from uwbslam_jax.files.schemas import Decoder, Options, Role, make_decoder, plausible
 from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, ScanMessage, TruthMessage
 
-TRUTH_ROBOT = "/ground_truth/robot"
-TRUTH_BEACON = "/ground_truth/beacon/"
-_KEYS: dict[Role, str] = {"scan": "lidar.topic", "uwb": "uwb.topic", "odom": "odom.topic"}  # as in the settings
+TRUTH_ROBOT, TRUTH_BEACON = "/ground_truth/robot", "/ground_truth/beacon/"
+"""Topics of the ground truth, of a beacon without its id [topic]: none is taken for a sensor's."""
+_KEYS: dict[Role, str] = {"scan": "lidar.topic", "uwb": "uwb.topic", "odom": "odom.topic"}
+"""The setting that chooses a role's topic [role -> key]: where several topics fit, the error names it."""
 
 
 class LogReader:
@@ -95,8 +96,8 @@ class LogReader:
         """Where robot and beacons were, None where the recording has no truth of the robot; read through for it."""
         wanted = {number: decode for number, decode in self._decoders.items() if self._roles[number] == "truth"}
         truths = [m for at, n, raw in self._recording.records(set(wanted)) for m in wanted[n](raw, at)]
-        told = [m for m in truths if isinstance(m, TruthMessage)]
-        return Truth.from_messages(told) if any(m.node is None for m in told) else None
+        poses = [m for m in truths if isinstance(m, TruthMessage)]
+        return Truth.from_messages(poses) if any(m.node is None for m in poses) else None
 
     def __iter__(self) -> Iterator[Message]:
         self._options.dropped.clear()
@@ -175,12 +176,7 @@ class LogWriter:
     """Writes measurements as a ROS 2 recording; a context manager that always finishes the file."""
 
     def __init__(
-        self,
-        path: str | Path,
-        *,
-        scan_topic: str = "/scan",
-        uwb_topic: str = "/uwb/ranges",
-        odom_topic: str = "/odom",
+        self, path: str | Path, *, scan_topic: str = "/scan", uwb_topic: str = "/uwb/ranges", odom_topic: str = "/odom"
     ):
         """Opens the file, replacing one that is there. Raises LogError."""
         self._records = RecordWriter(path)

@@ -1,6 +1,6 @@
 """A Result as a ROS 2 recording for Foxglove and RViz: map, path, poses, transforms, beacons and diagnostics.
 
-Messages are made as their type and CDR bytes; `publish` sends the same ones.
+Messages are made as their type and CDR bytes; `live.publisher` sends the same ones.
 """
 
 from __future__ import annotations
@@ -16,29 +16,30 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from uwbslam_jax.files.mcap_container import RecordWriter
-from uwbslam_jax.files.ros_types import build, definition, header, pose, quaternion, serialize, time, vector
+from uwbslam_jax.files.ros_types import CDR, build, definition, header, pose, quaternion, serialize, time, vector
 from uwbslam_jax.result import BeaconEstimate, BeaconStatus, MapImage, Result, crop
 
-DIAGNOSTICS_PERIOD = 100_000_000  # at most 10 Hz [ns]
-PATH_PERIOD = 100_000_000  # at most 10 Hz [ns]: one message, for looking at; /tf has every pose
-BEACONS_PERIOD = 1_000_000_000  # about 1 Hz [ns]
+DIAGNOSTICS_PERIOD, PATH_PERIOD, BEACONS_PERIOD = 100_000_000, 100_000_000, 1_000_000_000
+"""Least time between two values, poses of the path, and beacons [ns]: for looking at; /tf has every pose."""
 MAP_FRAME, UWB_FRAME = "map", "uwb"
-_COLORS = {  # of a beacon
+"""Frames [name]: the fixed one (REP 105), and that of recorded ranges at the same place, or viewers miss it."""
+_COLORS = {
     BeaconStatus.STATIC: (0.1, 0.6, 0.2),
     BeaconStatus.MOVING: (0.9, 0.5, 0.0),
     BeaconStatus.SILENT: (0.5, 0.5, 0.5),
     BeaconStatus.DROPPED: (0.8, 0.1, 0.1),
     BeaconStatus.RELATIVE: (0.2, 0.45, 0.8),
 }
-
-
-# Poses and transforms are packed by hand: there is one of each a frame, and the type store takes 0.1 ms for each.
+"""Red, green, blue of a beacon by its status [0 to 1]: from green, at rest, to red, given up."""
 _POSE_TYPE, _TF_TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped", "tf2_msgs/msg/TFMessage"
-_POSE = struct.Struct("<4siII4s7d36d")  # CDR, stamp, "map\0", position and orientation, covariance
-_TF = struct.Struct("<4sIiII4sI10s6x7d")  # CDR, one transform: stamp, "map\0", "base_link\0", padding, both vectors
-_CDR = b"\x00\x01\x00\x00"
+"""Packed by hand [ROS type]: there is one of each a frame, and the type store takes 0.1 ms for each."""
+_POSE, _TF = struct.Struct("<4siII4s7d36d"), struct.Struct("<4sIiII4sI10s6x7d")
+"""Head, stamp, "map", position and orientation, covariance; head, number of transforms, stamp, "map", "base_link",
+padding, both vectors [bytes]."""
 _PLANAR = [6 * row + column for row in (0, 1, 5) for column in (0, 1, 5)]
-_STAMPED = np.dtype([("time", "<u4", 2), ("length", "<u4"), ("frame", "S4"), ("pose", "<f8", 7)])  # PoseStamped
+"""Where x, y, yaw stand in a 6 x 6 covariance over x, y, z, roll, pitch, yaw [index]."""
+_STAMPED = np.dtype([("time", "<u4", 2), ("length", "<u4"), ("frame", "S4"), ("pose", "<f8", 7)])
+"""CDR of a PoseStamped, so that a path is one array [s and ns, bytes, name, m and quaternion]."""
 
 
 class _Item(NamedTuple):
@@ -59,12 +60,7 @@ def write_result_log(result: Result, path: str | Path) -> None:
     """
     known = np.flatnonzero(np.isfinite(result.poses).all(axis=1)) if len(result.stamps) else np.zeros(0, int)
     start = int(result.stamps[0]) if len(result.stamps) else 0
-    streams = [
-        _once(result, start, known),
-        _poses(result, known),
-        _beacons(result, start),
-        _diagnostics(result),
-    ]
+    streams = [_once(result, start, known), _poses(result, known), _beacons(result, start), _diagnostics(result)]
     channels: dict[str, int] = {}
     with RecordWriter(path, chunk_size=1 << 20) as records:
         for item in heapq.merge(*streams, key=lambda item: item.stamp):
@@ -129,13 +125,13 @@ def pose_with_covariance(stamp: int, x: float, y: float, yaw: float, cov: np.nda
     for at, value in zip(_PLANAR, cov.ravel().tolist(), strict=True):
         full[at] = value if math.isfinite(value) else 0.0  # RViz refuses a NaN
     place = x, y, 0.0, 0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)
-    return _POSE_TYPE, _POSE.pack(_CDR, *divmod(stamp, 1_000_000_000), 4, b"map", *place, *full)
+    return _POSE_TYPE, _POSE.pack(CDR, *divmod(stamp, 1_000_000_000), 4, b"map", *place, *full)
 
 
 def robot_transform(stamp: int, x: float, y: float, yaw: float) -> tuple[str, bytes]:
     """TFMessage of the robot: what `_transform` says, packed."""
     place = x, y, 0.0, 0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)
-    return _TF_TYPE, _TF.pack(_CDR, 1, *divmod(stamp, 1_000_000_000), 4, b"map", 10, b"base_link", *place)
+    return _TF_TYPE, _TF.pack(CDR, 1, *divmod(stamp, 1_000_000_000), 4, b"map", 10, b"base_link", *place)
 
 
 def _transform(stamp: int, child: str, x: float, y: float, yaw: float) -> Any:
@@ -149,7 +145,7 @@ def _transform(stamp: int, child: str, x: float, y: float, yaw: float) -> Any:
 
 def _path(result: Result, stamp: int, known: np.ndarray) -> tuple[str, bytes]:
     """Path of some poses, packed."""
-    head = _CDR + struct.pack("<iII4sI", *divmod(stamp, 1_000_000_000), 4, b"map", len(known))
+    head = CDR + struct.pack("<iII4sI", *divmod(stamp, 1_000_000_000), 4, b"map", len(known))
     rows = np.zeros(len(known), _STAMPED)
     rows["time"] = np.stack(np.divmod(result.stamps[known], 1_000_000_000), axis=-1)
     rows["length"], rows["frame"] = 4, b"map"
@@ -267,11 +263,6 @@ def _status(stamp: int, diagnostics: dict[str, np.ndarray], index: int) -> Any:
         for name, series in diagnostics.items()
     ]
     status = build(
-        "diagnostic_msgs/msg/DiagnosticStatus",
-        level=0,
-        name="uwbslam",
-        message="",
-        hardware_id="",
-        values=values,
+        "diagnostic_msgs/msg/DiagnosticStatus", level=0, name="uwbslam", message="", hardware_id="", values=values
     )
     return build("diagnostic_msgs/msg/DiagnosticArray", header=header(stamp, ""), status=[status])

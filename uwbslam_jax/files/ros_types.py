@@ -17,6 +17,7 @@ from rosbags.typesys.store import Typestore
 from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, ScanMessage
 
 UWB_RANGE = "uwbslam_msgs/msg/UwbRange"
+"""Type of a range [ROS type]: no standard one is of two nodes."""
 UWB_RANGE_TEXT = """\
 std_msgs/Header header        # stamp of the exchange
 uint32 source                 # node that started it
@@ -25,10 +26,13 @@ float32 range                 # m
 float32 receive_power         # dBm, NaN where the radio does not say
 float32 first_path_power      # dBm, NaN where the radio does not say
 """
+"""Its definition [ros2msg], which a recording carries; its comments give the units."""
 _SEPARATOR = "=" * 80 + "\n"
-_CDR = b"\x00\x01\x00\x00"  # plain CDR, little-endian
-_RANGE = struct.Struct("<4siII4sIIfff")  # ... stamp, "uwb\0", then the five fields
-_SCAN = struct.Struct("<4siII8s7fI")  # ... stamp, "laser\0" padded to 4, the seven scalars, number of ranges
+"""What stands between two definitions of a ros2msg text [text] (MCAP specification, Well-known schema encodings)."""
+CDR = b"\x00\x01\x00\x00"
+"""Head of plain CDR, little-endian [bytes] (DDSI-RTPS 2.3, 10.5)."""
+_RANGE, _SCAN = struct.Struct("<4siII4sIIfff"), struct.Struct("<4siII8s7fI")
+"""Head, stamp, "uwb", five fields; head, stamp, "laser" padded to 8, seven scalars, number of ranges [bytes]."""
 
 
 def _make_store() -> Typestore:
@@ -38,7 +42,7 @@ def _make_store() -> Typestore:
 
 
 STORE = _make_store()
-"""ROS 2 Humble's types and UwbRange: what is written, and what a recording without definitions is read with."""
+"""Humble's types and UwbRange [ROS types]: what is written, and what a recording without definitions is read with."""
 
 
 def definition(schema: str) -> bytes:
@@ -97,13 +101,13 @@ def encode(message: Message) -> tuple[str, bytes]:
     if isinstance(message, RangeMessage):
         ends = message.source, message.target
         values = message.range, message.receive_power, message.first_path_power
-        return UWB_RANGE, _RANGE.pack(_CDR, sec, nanosec, 4, b"uwb", *ends, *values)
+        return UWB_RANGE, _RANGE.pack(CDR, sec, nanosec, 4, b"uwb", *ends, *values)
     if isinstance(message, ScanMessage):
         ranges = np.ascontiguousarray(message.ranges, dtype="<f4")
         step, between, beams = message.angle_increment, message.time_increment, ranges.size
         angles = message.angle_min, message.angle_min + step * max(beams - 1, 0), step
         rest = between, between * beams, message.range_min, message.range_max, beams
-        head = _SCAN.pack(_CDR, sec, nanosec, 6, b"laser", *angles, *rest)
+        head = _SCAN.pack(CDR, sec, nanosec, 6, b"laser", *angles, *rest)
         return "sensor_msgs/msg/LaserScan", head + ranges.tobytes() + bytes(4)  # no intensities
     if isinstance(message, OdometryMessage):
         filled = _odometry(message)

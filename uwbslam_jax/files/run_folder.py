@@ -18,7 +18,8 @@ from uwbslam_jax.errors import RunError
 from uwbslam_jax.files.result_log import write_result_log
 from uwbslam_jax.result import OCCUPIED_THRESHOLD, BeaconEstimate, BeaconStatus, MapImage, Result, crop, trinary
 
-FREE_THRESHOLD = 0.196  # below what 205 reads as, (255 - 205) / 255, so that unknown stays unknown
+FREE_THRESHOLD = 0.196
+"""Probability below which map_server takes a cell as free [1]: under that of gray 205, 50 / 255, which is unknown."""
 
 
 @dataclass(frozen=True, slots=True)

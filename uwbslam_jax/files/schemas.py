@@ -30,33 +30,34 @@ from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, Sca
 Role = Literal["scan", "uwb", "odom", "truth"]
 Decoder = Callable[[bytes, int], list[Message]]
 
-_NAMES: dict[Role, str] = {  # what a type is called, by role; the package does not matter
+_NAMES: dict[Role, str] = {
     "scan": r"LaserScan",
     "uwb": r"UwbRange|LinktrackNodeframe[23]|.*RangeStamped",
     "odom": r"Odometry",
     "truth": r"PoseStamped|PointStamped",
 }
+"""What a type is called [role -> regex]; the package does not matter, since vendors have their own."""
 SUPPORTED: dict[Role, str] = {
     "scan": "sensor_msgs/LaserScan, foxglove.LaserScan",
     "uwb": "UwbRange, LinktrackNodeframe2, LinktrackNodeframe3, RangeStamped",
     "odom": "nav_msgs/Odometry",
     "truth": "geometry_msgs/PoseStamped, geometry_msgs/PointStamped",
 }
+"""Types that are read [role -> text], for an error about another one."""
 _WORDS: dict[Role, str] = {"scan": "scan", "uwb": "range", "odom": "odometry", "truth": "ground truth"}
-_FIELDS: dict[Role, dict[str, set[str]]] = {  # the layouts we read, told apart by the fields they have
+"""What messages call a role [role -> text]."""
+_FIELDS: dict[Role, dict[str, set[str]]] = {
     "scan": {
         "ros": {"angle_min", "angle_increment", "time_increment", "range_min", "range_max", "ranges"},
         "foxglove": {"start_angle", "end_angle", "ranges"},
     },
-    "uwb": {
-        "range": {"source", "target", "range"},
-        "stamped": {"to_id", "range"},
-        "linktrack": {"id", "nodes"},
-    },
+    "uwb": {"range": {"source", "target", "range"}, "stamped": {"to_id", "range"}, "linktrack": {"id", "nodes"}},
     "odom": {"odom": {"pose", "child_frame_id"}},
     "truth": {"pose": {"header", "pose"}, "point": {"header", "point"}},
 }
+"""Layouts that are read, by the fields that they need [role -> layout -> fields]."""
 _MALFORMED = (SerdeError, struct.error, AttributeError, TypeError, ValueError, LookupError, ArithmeticError)
+"""What decoding damaged bytes raises [exceptions]: rosbags passes on those of struct, numpy and the builtins."""
 
 
 @dataclass
@@ -112,7 +113,7 @@ def _base_name(schema: str) -> str:
 
 
 def _unpacker(channel: Channel, role: Role) -> tuple[Callable[[bytes], Any], set[str] | None]:
-    """From bytes to an object with the message's fields, and the names of these where the definition tells."""
+    """From bytes to an object with the message's fields, and the names of these where there is a definition."""
     if channel.encoding in ("cdr", "ros1"):
         store, name = _store_of(channel)
         fields = {field_name for field_name, _ in store.fielddefs[name][1]}
@@ -276,6 +277,7 @@ _TAKE: dict[Role, Callable[[Any, int, Options], list[Message]]] = {
     "odom": _take_odometry,
     "truth": _take_truth,
 }
+"""From an unpacked message to its measurements [role -> function]."""
 
 
 def _varint(data: bytes, position: int) -> tuple[int, int]:

@@ -1,4 +1,4 @@
-"""Settings in and out: reading TOML, checking ranges, writing TOML. What the settings are stands in `config`."""
+"""Settings in and out: reading TOML, checking ranges, writing TOML. What the settings are is in `settings`."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 from uwbslam_jax.errors import ConfigError
 from uwbslam_jax.settings import Settings
 
-_MAX_CELLS = 4096  # side of the finest level of the matching window; beyond this the maps alone take gigabytes
-
+_MAX_CELLS = 4096
+"""Side of the matching window at its finest level [cells]; beyond this the maps alone take gigabytes."""
 _POSITIVE = [
     *("uwb.sigma_n", "uwb.max_range", "lidar.max_range", "odom.sigma_floor", "map.resolution", "map.size_m"),
     *(
@@ -24,13 +24,14 @@ _POSITIVE = [
         "filter.sigma_w_yaw",
         "filter.sigma_w_beacon",
         "filter.sigma_w_carried",
-        "filter.sigma_l",
-        "filter.independent_beams",
     ),
-    *("filter.sigma_map", "filter.sigma_map_yaw"),
+    *("filter.sigma_l", "filter.independent_beams", "filter.sigma_map", "filter.sigma_map_yaw"),
 ]
+"""Settings that mean nothing at 0 [keys]: noises are divided by, and limits would leave no measurement."""
 _NOT_NEGATIVE = ["uwb.nlos_gap_db", "lidar.min_range", "odom.sigma_xy", "odom.sigma_yaw", "filter.gamma"]
-_MAY_BE_INFINITE = ["uwb.nlos_gap_db"]  # switches the rule off
+"""Settings that may be 0, which leaves out what they weigh [keys]."""
+_MAY_BE_INFINITE = ["uwb.nlos_gap_db"]
+"""Settings whose infinity switches their rule off [keys]."""
 _LIMITS = {
     "robot.id": (0, 2**32 - 1),
     "uwb.max_beacons": (1, 200),
@@ -38,6 +39,7 @@ _LIMITS = {
     "map.levels": (1, 5),
     "uwb.bias_scale": (-0.5, 1.0),
 }
+"""Least and greatest value of a setting [its unit]: ids have 32 bits; beyond the others lie mistakes."""
 
 
 def load_settings(path: Path | str) -> Settings:
@@ -100,7 +102,7 @@ def differences(settings: Settings) -> str:
 
 
 def save_settings(settings: Settings, path: Path | str) -> None:
-    """Writes what differs from the defaults as TOML; `load_settings` reads it back to equal settings. Raises OSError."""
+    """Writes what differs from the defaults as TOML, which `load_settings` reads back. Raises OSError."""
     Path(path).write_text(differences(settings), encoding="utf-8")
 
 
@@ -116,12 +118,7 @@ def check(settings: Settings) -> Settings:
     Raises:
       ConfigError: one line that names the first key out of range, its value and what is allowed.
     """
-    flat: dict[str, Any] = {
-        f"{section.name}.{key.name}": getattr(getattr(settings, section.name), key.name)
-        for section in dataclasses.fields(settings)
-        for key in dataclasses.fields(getattr(settings, section.name))
-    }
-    for name, value in flat.items():
+    for name, value in _flat(settings).items():
         for number in _numbers(value):
             _check_number(name, number)
         if isinstance(value, dict):
@@ -134,6 +131,12 @@ def check(settings: Settings) -> Settings:
         raise ConfigError(f"filter.preset = {settings.filter.preset!r}: must be 'robust' or 'paper'")
     _check_together(settings)
     return settings
+
+
+def _flat(settings: Settings) -> dict[str, Any]:
+    """section.key -> value."""
+    sections = {section.name: getattr(settings, section.name) for section in dataclasses.fields(settings)}
+    return {f"{name}.{key}": value for name, section in sections.items() for key, value in vars(section).items()}
 
 
 def _check_number(name: str, number: float) -> None:
@@ -175,12 +178,7 @@ def _numbers(value: Any) -> list[float]:
 
 def _unknown(name: str) -> str:
     """Message for an unknown key or section that names the nearest known one."""
-    known = [
-        f"{section.name}.{key.name}"
-        for section in dataclasses.fields(Settings)
-        for key in dataclasses.fields(getattr(Settings(), section.name))
-    ]
-    sections = [section.name for section in dataclasses.fields(Settings)]
+    known, sections = list(_flat(Settings())), [section.name for section in dataclasses.fields(Settings)]
     section, _, key = name.rpartition(".")
     elsewhere = [other for other in known if other.split(".")[1] == key]
     within = [other for other in known if other.split(".")[0] == section]

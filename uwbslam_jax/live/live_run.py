@@ -27,15 +27,14 @@ from uwbslam_jax.measurements import ScanMessage
 from uwbslam_jax.session import Facts, Saved, Update, saved_state
 from uwbslam_jax.web import LivePage, Status
 
-_IDLE_S = 0.05
-_STATUS_S = 0.5
-_SAVE_S = 10.0
+_IDLE_S, _STATUS_S, _SAVE_S = 0.05, 0.5, 10.0
+"""Time between two looks at `go`, two figures for the page, two saved states, of which a killed run loses one [s]."""
 _RECENT = 400
-"""Latencies that the figures on the page are of."""
+"""Latencies that the figures on the page are of [scans]: enough for a 99 % quantile, few enough to be recent."""
 _SWITCH_S = 0.5e-3
-"""A thread that waits for the interpreter gets it after so long: with 5 ms, three threads cost a scan's period."""
+"""A thread that waits for the interpreter gets it after so long: with 5 ms, three threads cost a scan's period [s]."""
 _NO_LOSS = {"measurements", "bytes", "connections"}
-"""What devices count that is no measurement lost."""
+"""What devices count that is no measurement lost [names]."""
 
 
 class LiveRun:
@@ -58,7 +57,7 @@ class LiveRun:
 
         Args:
           slam: the run, with room for lidar.max_beams beams.
-          page, publisher: who is told of each step.
+          page, publisher: get each step.
 
         Raises:
           LogError: the recording cannot be opened.
@@ -99,7 +98,7 @@ class LiveRun:
         if self._devices.defect is not None:
             raise self._devices.defect
         self._save(wait=True)
-        self._tell(result)
+        self._complete(result)
         return result
 
     def _turn(self, timeout: float) -> bool:
@@ -168,8 +167,8 @@ class LiveRun:
             counts.update({why: n for why, n in source.counts.items() if why not in _NO_LOSS})
         return counts
 
-    def _tell(self, result: Result) -> None:
-        """What only a live run knows goes into the Result."""
+    def _complete(self, result: Result) -> None:
+        """Adds to the Result what only a live run knows."""
         summary, most = result.summary, self._slam.settings.lidar.max_beams
         if self._recorder.failure:
             summary["warnings"].append(f"recording: {self._recorder.failure}")

@@ -14,11 +14,11 @@ from typing import NamedTuple
 from uwbslam_jax.measurements import Message, ScanMessage
 
 BEHIND_S = 0.7
-"""Once a scan has waited for so long, only the newest one is taken until the loop has caught up."""
+"""Once a scan has waited for so long, only the newest one is taken until the loop has caught up [s]."""
 MOST = 4096
-"""Messages that wait; more are dropped, the oldest first."""
-OVERTAKEN = "scan: overtaken by a newer one"
-OVERFULL = "message: the queue is full"
+"""Messages that wait [messages], several seconds of all devices; more are dropped, the oldest first."""
+OVERTAKEN, OVERFULL = "scan: overtaken by a newer one", "message: the queue is full"
+"""Reasons of a loss in `Inbox.dropped` [text]."""
 
 
 class Arrival(NamedTuple):

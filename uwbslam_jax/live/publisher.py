@@ -14,8 +14,8 @@ from uwbslam_jax.errors import UsageError
 from uwbslam_jax.files import result_log, ros_types
 from uwbslam_jax.session import Session, Update
 
-BEACONS_S = 1.0
-MAP_S = 5.0
+BEACONS_S, MAP_S = 1.0, 5.0
+"""Time between two messages of the beacons, which hardly move, and of the map, which is large [s]."""
 
 
 class Publisher:
@@ -39,7 +39,7 @@ class Publisher:
             raise UsageError(f"publishing at {host}:{port}: {error}") from None
         self.url = f"ws://{host}:{self._server.port}"
         self._channels: dict[str, Any] = {}
-        self._told_at = self._map_at = 0.0
+        self._beacons_at = self._map_at = 0.0
 
     def step(self, session: Session, update: Update) -> None:
         """Takes in one step; called by the loop."""
@@ -47,8 +47,8 @@ class Publisher:
         x, y, yaw = update.pose.tolist()
         self._log("/pose", result_log.pose_with_covariance(stamp, x, y, yaw, update.cov), stamp)
         self._log("/tf", result_log.robot_transform(stamp, x, y, yaw), stamp)
-        if now - self._told_at > BEACONS_S:
-            self._told_at = now
+        if now - self._beacons_at > BEACONS_S:
+            self._beacons_at = now
             placed = [b for b in update.beacons.values() if np.isfinite(b.position).all()]
             self._log("/beacons", result_log.beacon_markers(stamp, placed), stamp)
         if now - self._map_at > MAP_S and session.state.scans_drawn > 0:

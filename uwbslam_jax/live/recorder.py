@@ -17,9 +17,9 @@ from uwbslam_jax.live.message_queue import Arrival
 from uwbslam_jax.settings import Settings
 
 EVERY_S = 0.25
-"""Time between two hand-overs to the operating system; a killed process loses no more than that and what waits."""
+"""Time between two hand-overs to the operating system; a killed process loses no more than that and what waits [s]."""
 DROPPED = "_dropped"
-"""Added to the scan topic for scans that the estimator did not use."""
+"""Added to the scan topic for scans that the estimator did not use [text]: another topic, which `run` ignores."""
 
 
 class LogRecorder:

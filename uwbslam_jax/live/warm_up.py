@@ -13,10 +13,11 @@ from uwbslam_jax.sim import INF, START_NS, Lidar, make_scenario, simulate
 _RATE = 5.0
 """Scans a second: few, as each is traced through a world [Hz]."""
 _REST_S = 3.5
-"""The simulated robot rests for four seconds; the rest is left out."""
+"""The simulated robot rests for four seconds, most of which is left out [s]."""
 _AFTER_S = 8.0
-"""After the frame is decided, so long: until biases have been looked for, too."""
+"""Goes on for so long after the frame is decided: until biases have been looked for, too [s]."""
 _LONGEST_S = 40.0
+"""Length of the simulation [s]: the frame is decided well before, and a run that does not decide ends all the same."""
 
 
 def rehearse(settings: Settings) -> None:

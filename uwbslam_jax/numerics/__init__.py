@@ -39,7 +39,9 @@ from uwbslam_jax.numerics.se2_host import (
     carried_along as carried_along,
     compose as compose,
     numeric_jacobian as numeric_jacobian,
+    rigid_fit as rigid_fit,
     rotation_matrix as rotation_matrix,
+    transformed as transformed,
     turned as turned,
     wrapped as wrapped,
 )

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TypeVar
+
 import numpy as np
+
+Angle = TypeVar("Angle", float, np.ndarray)
 
 
 def turned(theta: np.ndarray | np.floating | float, xy: np.ndarray) -> np.ndarray:
     """Vectors (..., 2) turned by angles (...) [rad]."""
     c, s = np.cos(theta), np.sin(theta)
     return np.stack([c * xy[..., 0] - s * xy[..., 1], s * xy[..., 0] + c * xy[..., 1]], axis=-1)
+
+
+def transformed(pose: np.ndarray, xy: np.ndarray) -> np.ndarray:
+    """Points (..., 2) given in the frames of poses (..., 3), in the frame that these are given in [m]."""
+    return pose[..., :2] + turned(pose[..., 2], xy)
 
 
 def carried_along(
@@ -25,7 +35,8 @@ def carried_along(
     return (1 - share) * ends[0] + share * ends[1]
 
 
-def numeric_jacobian(function, x: np.ndarray) -> np.ndarray:
+def numeric_jacobian(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray) -> np.ndarray:
+    """(m, n) derivatives of a function (n,) -> (m,) at x, by central differences."""
     h = 1e-6
     columns = [(function(x + h * e) - function(x - h * e)) / (2 * h) for e in np.eye(len(x))]
     return np.stack(columns, axis=1)
@@ -46,12 +57,28 @@ def between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.stack([c * dx + s * dy, -s * dx + c * dy, b[..., 2] - a[..., 2]], axis=-1)
 
 
-def rotation_matrix(theta: float) -> np.ndarray:
-    """(2, 2) rotation by an angle [rad]."""
+def rotation_matrix(theta: float, size: int = 2) -> np.ndarray:
+    """(size, size) rotation of the first two axes by an angle [rad]; with 3 that of a pose's covariance."""
+    R = np.eye(size)
     c, s = np.cos(theta), np.sin(theta)
-    return np.array([[c, -s], [s, c]])
+    R[:2, :2] = [[c, -s], [s, c]]
+    return R
 
 
-def wrapped(angle):
+def rigid_fit(points: np.ndarray, onto: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
+    """(3,) the pose with the least weighted sum of |transformed(pose, points) - onto|^2, both (n, 2) (Umeyama 1991).
+
+    A rotation whatever the points: where a reflection fits better, this is the best rotation.
+    """
+    w = np.ones(len(points)) if weights is None else weights
+    mean_a, mean_b = np.average(points, axis=0, weights=w), np.average(onto, axis=0, weights=w)
+    # in the plane the best angle has a closed form: the direction of sum w conj(a) b as complex numbers
+    a, b = points - mean_a, onto - mean_b
+    along = np.sum(w * (a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1]))
+    theta = np.arctan2(np.sum(w * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])), along)
+    return np.append(mean_b - turned(theta, mean_a), theta)
+
+
+def wrapped(angle: Angle) -> Angle:
     """The same angles in [-pi, pi) [rad]."""
     return (angle + np.pi) % (2 * np.pi) - np.pi

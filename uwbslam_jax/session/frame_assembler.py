@@ -25,6 +25,7 @@ from uwbslam_jax.measurements import (
     StampedFrame,
     TruthMessage,
 )
+from uwbslam_jax.numerics import between, wrapped
 from uwbslam_jax.settings import Settings
 
 _SCANLESS_S = 1.0
@@ -221,11 +222,9 @@ class FrameAssembler:
         keep = max(0, bisect_right([m.stamp for m in track], stamp) - 2)
         del track[:keep]
         self.odometry_used = True
-        c, s = np.cos(a[2]), np.sin(a[2])
-        dx, dy = b[0] - a[0], b[1] - a[1]
-        turn = (b[2] - a[2] + np.pi) % (2 * np.pi) - np.pi
-        increment = np.array([c * dx + s * dy, -s * dx + c * dy, turn], np.float32)
-        return Odometry(increment, np.bool_(True))
+        increment = between(np.array(a), np.array(b))
+        increment[2] = wrapped(increment[2])
+        return Odometry(increment.astype(np.float32), np.bool_(True))
 
 
 def _pose_at(track: list[OdometryMessage], stamp: int) -> tuple[float, float, float]:
@@ -233,8 +232,7 @@ def _pose_at(track: list[OdometryMessage], stamp: int) -> tuple[float, float, fl
     at = min(max(bisect_right([m.stamp for m in track], stamp), 1), len(track) - 1)
     a, b = track[at - 1], track[at]
     f = min((stamp - a.stamp) / (b.stamp - a.stamp), 1.0 + _ODOMETRY_HOLD_S * 1e9 / (b.stamp - a.stamp))
-    turn = (b.yaw - a.yaw + np.pi) % (2 * np.pi) - np.pi
-    return a.x + f * (b.x - a.x), a.y + f * (b.y - a.y), a.yaw + f * turn
+    return a.x + f * (b.x - a.x), a.y + f * (b.y - a.y), a.yaw + f * wrapped(b.yaw - a.yaw)
 
 
 def pad_scan(scan: ScanMessage | None, settings: Settings) -> Scan:

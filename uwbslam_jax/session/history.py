@@ -150,8 +150,7 @@ class History:
         if republish:
             self.poses.values[:] = moved.carry(stamps, self.poses.values)
             self.sight.values[:] += turn
-            R = np.eye(3)
-            R[:2, :2] = rotation_matrix(turn)
+            R = rotation_matrix(turn, 3)
             self.covs.values[:] = R @ self.covs.values @ R.T
 
 

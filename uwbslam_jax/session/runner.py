@@ -1,4 +1,4 @@
-"""Messages in, a Result out: frames -> session; steps groups of frames in batch mode, single ones online, the same bits."""
+"""Messages in, a Result out: frames -> session; groups of frames in batch mode, single ones online, the same bits."""
 
 from __future__ import annotations
 

@@ -137,7 +137,7 @@ class Session:
         return self.tiles.image(self.state.grid)
 
     def saved(self) -> Saved | None:
-        """A copy of what was found, to go on from; None before the frame is decided, or where the run only localises."""
+        """A copy of what was found, to go on from; None before the frame is decided, or where a run only localises."""
         known = self.decided_at is not None or self.settings.filter.lidar_only
         if self.fixed or not known:
             return None

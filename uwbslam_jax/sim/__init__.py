@@ -1,6 +1,5 @@
 """Worlds, devices and their faults, for recordings with ground truth."""
 
-from uwbslam_jax.sim import paths as paths, worlds as worlds
 from uwbslam_jax.sim.catalogue import SCENARIOS as SCENARIOS, make_scenario as make_scenario, spread as spread
 from uwbslam_jax.sim.rays import cast as cast, strike as strike
 from uwbslam_jax.sim.scenario import (

@@ -21,6 +21,9 @@ def make_scenario(name: str, seed: int = 0, duration_s: float | None = None) -> 
     """A ready-made scenario; each seed has its own world, beacons and orientation. `SCENARIOS` lists the names.
 
     duration_s: instead of the scenario's own; what happens once (but for the paper's schedule) happens sooner then.
+
+    Raises:
+      ValueError: no scenario of this name.
     """
     if name not in _MAKERS:
         raise ValueError(f"no scenario is called {name!r}; there are {', '.join(SCENARIOS)}")
@@ -148,7 +151,7 @@ def _spot_turns(seed: int, duration: float | None) -> Scenario:
 
 
 def _nlos(seed: int, duration: float | None) -> Scenario:
-    """The powers tell half to all of the blocked exchanges: that is a matter of the walls."""
+    """The powers show half to all of the blocked exchanges: that is a matter of the walls."""
     return replace(_hall(seed, duration), uwb=Uwb(nlos=True, nlos_detectable=stream(seed, "walls").uniform(0.5, 1.0)))
 
 
@@ -303,5 +306,6 @@ _MAKERS: dict[str, Callable[[int, float | None], Scenario]] = {
     "biased": _biased,
     "office": _office,
 }
+"""What makes a scenario of a seed and a duration, its own where None [name -> function]."""
 SCENARIOS = tuple(_MAKERS)
-"""Names of the ready-made scenarios."""
+"""Ready-made scenarios [names]."""

@@ -23,6 +23,7 @@ def strike(segments: np.ndarray, origins: np.ndarray, angles: np.ndarray) -> tup
       segments: (S, 4) [m].
       origins: (2,) or (B, 2) start of each ray [m]; they may differ by what a robot drives during one sweep.
       angles: (B,) bearing of each ray in the world [rad], increasing, of at most one turn in all.
+
     Returns:
       (B,) distance [m], inf where nothing is met; (B,) angle between ray and segment [rad] in [0, pi / 2], 0 for none.
     """

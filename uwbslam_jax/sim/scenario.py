@@ -1,6 +1,6 @@
 """The conditions of a simulation: world, path, beacons, devices and their faults, all in one Scenario.
 
-Nothing here measures or moves; `scenarios` has ready-made ones and `simulate` turns one into messages.
+Nothing here measures or moves; `catalogue` has ready-made ones and `simulate` turns one into messages.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from uwbslam_jax.sim.paths import Path
 from uwbslam_jax.sim.worlds import World
 
 INF = float("inf")
+"""No limit [s or m]."""
 Interval = tuple[float, float]
 """From, to [s since the start]."""
 
@@ -177,7 +178,4 @@ def settings_overrides(scenario: Scenario) -> dict[str, Any]:
     """What a user would configure for this robot: lever arms and heights; never what is to be found out."""
     antenna, lidar = (tuple(float(x) for x in pose) for pose in (scenario.uwb.antenna, scenario.lidar.pose))
     heights = {str(b.id): float(b.height) for b in scenario.beacons if b.height != antenna[2]}
-    return {
-        "robot": {"id": scenario.uwb.robot_id, "antenna": antenna, "lidar": lidar},
-        "uwb": {"height": heights},
-    }
+    return {"robot": {"id": scenario.uwb.robot_id, "antenna": antenna, "lidar": lidar}, "uwb": {"height": heights}}

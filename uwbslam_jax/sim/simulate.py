@@ -1,7 +1,7 @@
 """Simulation: a scenario becomes the messages that a robot driving through it would record, with ground truth.
 
 Pure numpy and no code shared with the estimator, so that neither can hide the other's mistakes. The worlds are in
-`worlds`, the driving in `paths`, the knobs in `conditions`, the ready-made scenarios in `scenarios`.
+`worlds`, the driving in `paths`, the conditions in `scenario`, the ready-made ones in `catalogue`.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ START_NS = 1_700_000_000_123_456_789
 UWB_PHASE = 0.0137
 """The first round of ranges starts this late [s]: two devices never share a clock."""
 ROUNDS = 16
-"""Rounds of ranges that are drawn at a time."""
+"""Rounds of ranges that are drawn at a time [rounds]: arrays are fast, and memory stays small."""
 _RANDOM = ("noise", "nlos", "outlier", "early", "power", "gap", "loss", "jitter")
-"""Each fault of a range draws from a stream of its own."""
+"""Each fault of a range draws from a stream of its own [name], so that none moves another's numbers."""
 TRUTH_PERIOD = 1.0
 """Time between two truths of a beacon at rest [s]; of one that is carried, a tenth of it."""
 

@@ -17,9 +17,9 @@ from uwbslam_jax.sim.rays import point_segment_distance
 Point = Sequence[float] | np.ndarray
 """x, y [m]."""
 CLEARANCE = 0.7
-"""Furniture stays this far from the route [m]."""
+"""Furniture stays this far from the route [m]: a robot and who carries a beacon beside it fit through."""
 WIDEST_CORNER = 1.5
-"""Routes of a corner radius up to this keep the clearance [m]."""
+"""Routes of a corner radius up to this keep the clearance [m]: those of the catalogue have up to 1.2 m."""
 
 
 @dataclass(frozen=True)

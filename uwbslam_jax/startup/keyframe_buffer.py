@@ -14,7 +14,7 @@ import numpy as np
 
 from uwbslam_jax.estimator import Estimate
 from uwbslam_jax.measurements import Snapshot, StampedFrame
-from uwbslam_jax.numerics import mean_sigma, turned
+from uwbslam_jax.numerics import mean_sigma, transformed, turned
 from uwbslam_jax.settings import HostParams
 
 _MOVED = (0.25, 0.2)
@@ -193,7 +193,7 @@ class Buffer:
         after = np.minimum(at + 1, len(stamps) - 1)
         share = np.where(after > at, (stamp - stamps[at]) / np.maximum(stamps[after] - stamps[at], 1.0), 0.0)
         share = np.clip(share, 0.0, 1.0)
-        antenna = pose[:, :2] + turned(pose[:, 2], self.host.antenna)
+        antenna = transformed(pose, self.host.antenna)
         local = [turned(-poses[k, 2], antenna - poses[k, :2]) for k in (at, after)]
         scatter = self._scatter(distance)
         # two means in each interval: one would leave the keyframes free to move to and fro between their middles

@@ -10,7 +10,16 @@ from itertools import pairwise
 
 import numpy as np
 
-from uwbslam_jax.numerics import CALIBRATED_M, DECIDED, largest_sigma, multilaterate, rotation_matrix, soften, turned
+from uwbslam_jax.numerics import (
+    CALIBRATED_M,
+    DECIDED,
+    between,
+    largest_sigma,
+    multilaterate,
+    rotation_matrix,
+    soften,
+    transformed,
+)
 from uwbslam_jax.startup.keyframe_buffer import Buffer, Keyframe
 
 _MOST_MOVES = 20
@@ -119,10 +128,7 @@ class Problem:
 
     def _antenna_ends(self, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The same as either keyframe alone would have it."""
-        return (
-            poses[self.at, :2] + turned(poses[self.at, 2], self.local_at),
-            poses[self.after, :2] + turned(poses[self.after, 2], self.local_after),
-        )
+        return transformed(poses[self.at], self.local_at), transformed(poses[self.after], self.local_after)
 
     def images(self, placement: Placement) -> list[tuple[np.ndarray, np.ndarray]]:
         """Beacons and poses of a placement mirrored along, across and through the start of the line that the robot's
@@ -278,11 +284,9 @@ def _steps(keys: list[Keyframe]) -> tuple[np.ndarray, np.ndarray]:
     """Relative poses of consecutive keyframes and the roots of their information, in the earlier one's frame."""
     steps, roots = np.zeros((len(keys) - 1, 3)), np.zeros((len(keys) - 1, 3, 3))
     for k, (a, b) in enumerate(pairwise(keys)):
-        u = turned(-a.pose[2], b.pose[:2] - a.pose[:2])
-        steps[k] = np.append(u, b.pose[2] - a.pose[2])
-        turn = np.eye(3)
-        turn[:2, :2] = rotation_matrix(a.pose[2]).T
-        length, angle = np.hypot(*u), abs(steps[k, 2])
+        steps[k] = between(a.pose, b.pose)
+        turn = rotation_matrix(a.pose[2], 3).T
+        length, angle = np.hypot(*steps[k, :2]), abs(steps[k, 2])
         elapsed = (b.frame.stamp - a.frame.stamp) / 1e9
         # where the match says nothing, wheels or the motion model still bound the step; where it says much, the map
         # it was matched with has its own drift

@@ -1,4 +1,4 @@
-"""Start-up as a part of the host: collects keyframes and ranges, solves now and then, and puts what is decided in place."""
+"""Start-up as a part of the host: collects keyframes and ranges, solves now and then, adopts what is decided."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from uwbslam_jax.backend import Graph, Problem, Solution
-from uwbslam_jax.numerics import Sink, between, compose, covariance, minimise, soften, turned, wrapped
+from uwbslam_jax.numerics import Sink, between, compose, covariance, minimise, soften, transformed, turned, wrapped
 from uwbslam_jax.settings import HostParams
 
 _SCALE = 0.1
@@ -113,7 +113,7 @@ class Mounting:
         keep = p.soft | ~self._rolled()[p.new]
         old, new, measured, roots, soft = (a[keep] for a in (p.old, p.new, p.between, p.roots, p.soft))
         columns = [*_columns(3 * old, 3), *_columns(3 * new, 3), *_shared(self.lidar, 3, len(old))]
-        own, back = self.host.lidar[None], _inverse(self.host.lidar[None])
+        own, back = self.host.lidar[None], between(self.host.lidar[None], np.zeros(3))
         motion = compose(compose(back, measured), own)
 
         def on_robot(m: Array) -> Array:
@@ -178,9 +178,9 @@ class Mounting:
         turn = wrapped(self.poses[p.at + 1, 2] - self.poses[p.at, 2])
 
         def residual(v: Array) -> Array:
-            change = compose(self.host.lidar + v[:, 10:], _inverse(np.broadcast_to(self.host.lidar, (len(v), 3))))
+            change = compose(self.host.lidar + v[:, 10:], between(self.host.lidar, np.zeros(3)))
             # robot frames of the run, as seen from those with this mounting
-            back = _inverse(change)
+            back = between(change, np.zeros(3))
             shift = compose(back, np.append(self.host.antenna, 0.0))[:, :2] - self.host.antenna
             ends = []
             for pose, lever, angle in (
@@ -188,8 +188,7 @@ class Mounting:
                 (v[:, 3:6], p.after, (p.share - 1) * turn),
             ):
                 moved = lever + turned(angle, shift)
-                there = change[:, :2] + turned(change[:, 2], moved)
-                ends.append(pose[:, :2] + turned(pose[:, 2], there))
+                ends.append(transformed(pose, transformed(change, moved)))
             antenna = (1 - p.share)[:, None] * ends[0] + p.share[:, None] * ends[1]
             distance = np.sqrt(np.sum((antenna - v[:, 6:8]) ** 2, axis=1) + p.rise**2)
             return soften((distance + v[:, 8] + v[:, 9] - p.distance) / (self.stage[1] * p.sigma))[0][:, None]
@@ -204,11 +203,6 @@ def _slip(old: Array, new: Array, scales: Array, wheels: Array) -> Array:
     e = moved * (1.0 + scales[:, [0, 0, 1]]) - wheels
     e[:, 2] = wrapped(e[:, 2])
     return e
-
-
-def _inverse(pose: Array) -> Array:
-    """The inverse of poses (n, 3)."""
-    return np.concatenate([-turned(-pose[:, 2], pose[:, :2]), -pose[:, 2:]], axis=1)
 
 
 def _columns(first: Array, count: int) -> list[Array]:

@@ -20,23 +20,26 @@ from uwbslam_jax.mapping import Grid, Tiles
 from uwbslam_jax.result import Event as RunEvent, RunStatus
 from uwbslam_jax.session import Session, Update
 from uwbslam_jax.web import page
-from uwbslam_jax.web.page_data import extent, numbers, picture
+from uwbslam_jax.web.page_data import beacon, extent, numbers, picture
 
 STEP_S = 0.1
-"""Time between two steps that are shown."""
-WORDS_S = 0.5
-MAP_S = 1.0
+"""Time between two steps that are shown: a scan's period, which looks continuous [s]."""
+WORDS_S, MAP_S = 0.5, 1.0
+"""Time between two updates of the words, which are read no faster, and of the map, which is large [s]."""
 _TRACK = 4000
-"""Poses of the track that are kept; then every other one is left out."""
+"""Poses of the track that are kept [poses]: more than a screen shows; then every other one is left out."""
 _LINK_S = 1.0
-"""A link is shown for so long after its last range."""
+"""A link is shown for so long after its last range: several rounds of ranging [s]."""
 _EVENTS = 12
+"""Events that are listed [lines]: what a screen holds beside the beacons."""
 _HINTS = {
     RunStatus.WAITING: "Waiting for motion: beacons and frame are found once the robot drives.",
     RunStatus.PLACING: "Placing beacons: not enough is known of them yet. Drive on, and turn.",
     RunStatus.UNDECIDED: "Reflection undecided: the ranges fit a mirrored place as well until the robot turns.",
 }
+"""What helps a run whose frame is not decided [status -> text]."""
 _COLUMNS = ("t", "x", "y", "yaw", "xx", "xy", "yy")
+"""Columns of the track, as map.js names them [s, m, m, rad, m^2, m^2, m^2]."""
 
 Event = tuple[str, str]
 """Name and JSON of an event."""
@@ -44,12 +47,12 @@ Event = tuple[str, str]
 
 @dataclass
 class Status:
-    """Figures of a live run that no estimate tells.
+    """Figures of a live run that are not in its estimates.
 
     Attributes:
       rates: of each device by name [1/s]; dropped: by reason.
-      latency_ms: scan arrival to published pose, median and 99 % of the last while; None before the first.
-      troubles: what a user should mend, one line each.
+      latency_ms: scan arrival to published pose, median and 99 % of the last few hundred; None before the first.
+      troubles: what a user should repair, one line each.
     """
 
     rates: dict[str, float] = field(default_factory=dict)
@@ -80,7 +83,7 @@ class LivePage:
         self.title = title
         self.watched = False
         self._now: _Now | None = None
-        self._told: _Now | None = None
+        self._sent: _Now | None = None
         self._status = Status()
         self._map: tuple[Grid, Tiles] | None = None
         self._map_at = 0.0
@@ -109,7 +112,7 @@ class LivePage:
         elif before is not None and t - before.t < STEP_S:
             return
         self._lidar = session.settings.robot.lidar
-        links = {pair: told for pair, told in self._links.items() if told[0] > t - _LINK_S}
+        links = {pair: link for pair, link in self._links.items() if link[0] > t - _LINK_S}
         now = _Now(t, update, session.history.events[-_EVENTS:], links)
         with self._lock:
             self._now, self._status = now, status
@@ -121,7 +124,7 @@ class LivePage:
             self._map = jax.tree.map(lambda leaf: np.array(leaf, copy=True), session.state.grid), session.tiles.copy()
 
     def _take_track(self, session: Session) -> None:
-        """What happened may have changed the track so far: the frame was decided, or a longer run tells it better."""
+        """What happened may have changed the track so far: the frame was decided, or revised."""
         history = session.history
         pick = np.unique(np.linspace(0, max(len(history.stamps) - 1, 0), _TRACK // 2).astype(int))
         with self._lock:
@@ -151,14 +154,8 @@ class LivePage:
         beacons = [] if now is None else _beacons(now)
         scan, links = ([], []) if now is None else (_scan(now, self._lidar), _shown_links(now))
         last = rows[-1][0] if rows else None
-        return {
-            **self._picture,
-            "duration": last or 1e-3,
-            "track": track,
-            "beacons": beacons,
-            "scan": scan,
-            "links": links,
-        }
+        shown = {"track": track, "beacons": beacons, "scan": scan, "links": links}
+        return {**self._picture, "duration": last or 1e-3, **shown}
 
     def events(self) -> Iterator[Event]:
         """What has changed since the last call, one event after the other."""
@@ -175,9 +172,9 @@ class LivePage:
             spots = [now.update.pose[None, :2], *(b.position[None] for b in now.update.beacons.values())]
             self._picture = {"map": drawn, "extent": extent(spots, drawn)}
             yield "map", _json(self._picture)
-        if now is self._told:
+        if now is self._sent:
             return
-        self._told = now
+        self._sent = now
         pose = dict(zip(_COLUMNS, _row(now.t, now.update.pose, now.update.cov), strict=True))
         shown = {"pose": pose, "scan": _scan(now, self._lidar), "links": _shown_links(now), "beacons": _beacons(now)}
         yield "step", _json(shown)
@@ -189,10 +186,10 @@ class LivePage:
         notices = [("warn", text) for text in status.troubles]
         if now is None:
             return "words", _json({"notices": page.notices([*notices, ("info", "Waiting for the first scan.")])})
-        told = now.update
-        if not told.decided and told.status in _HINTS:
-            notices.append(("warn", _HINTS[told.status]))
-        if bool(told.estimate.poor) and told.score is not None:
+        update = now.update
+        if not update.decided and update.status in _HINTS:
+            notices.append(("warn", _HINTS[update.status]))
+        if bool(update.estimate.poor) and update.score is not None:
             notices.append(("info", "The scan does not fit the map: it is not drawn."))
         begin = self._start or 0
         rows = [(f"{(event.stamp - begin) / 1e9:.1f}", event.text) for event in reversed(now.events)]
@@ -200,7 +197,7 @@ class LivePage:
             {
                 "notices": page.notices(notices),
                 "tiles": page.tiles(_figures(now, status)),
-                "beacon-words": page.beacon_table(list(told.beacons.values())),
+                "beacon-words": page.beacon_table(list(update.beacons.values())),
                 "event-words": page.table(("Time [s]", "What happened"), rows, [0]),
             }
         )
@@ -226,17 +223,7 @@ def _shown_links(now: _Now) -> list[list[float | None]]:
 
 
 def _beacons(now: _Now) -> list[dict[str, Any]]:
-    placed = [b for b in now.update.beacons.values() if np.isfinite(b.position).all()]
-    return [
-        {
-            "id": b.id,
-            "status": b.status,
-            **dict(zip("xy", numbers(b.position, 3), strict=True)),
-            "cov": numbers(np.array([b.cov[0, 0], b.cov[0, 1], b.cov[1, 1]]), 6),
-            "track": None,
-        }
-        for b in placed
-    ]
+    return [beacon(b, 3) for b in now.update.beacons.values() if np.isfinite(b.position).all()]
 
 
 def _figures(now: _Now, status: Status) -> list[tuple[str, str, str]]:

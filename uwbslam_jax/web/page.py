@@ -20,6 +20,7 @@ from uwbslam_jax import __version__
 from uwbslam_jax.result import BeaconEstimate
 
 _SCRIPTS = ("map.js", "charts.js", "live.js")
+"""Scripts of the page [files], in the order in which they use each other."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class Parts:
     Attributes:
       title, subtitle: plain text.
       notices, tiles, sections: HTML.
-      data: for the scripts, see report_data.page_data.
+      data: for the scripts, see page_data.page_data.
     """
 
     title: str

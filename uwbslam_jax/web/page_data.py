@@ -12,10 +12,9 @@ import numpy as np
 
 from uwbslam_jax.result import BeaconEstimate, MapImage, Result, crop
 
-# Embedded at most: what a screen can show and a file of a few megabytes holds.
 _POSES, _SAMPLES, _RESIDUALS, _PIXELS = 6000, 2000, 12_000, 2000
-
-# name -> label, unit; the order is that on the page.
+"""Most poses, values of a series, residuals, and pixels along the map [each]: a screen shows no more, and the file
+stays at a few megabytes."""
 _DIAGNOSTICS: dict[str, tuple[str, str]] = {
     "match_score": ("Match score", ""),
     "step_ms": ("Step time", "ms"),
@@ -24,6 +23,7 @@ _DIAGNOSTICS: dict[str, tuple[str, str]] = {
     "ranges_used": ("Ranges used", "a frame"),
     "searched": ("Wide searches", ""),
 }
+"""Label and unit of a series [name -> texts]; the order is that on the page."""
 
 
 def span(result: Result) -> float:
@@ -69,7 +69,7 @@ def page_data(result: Result) -> dict[str, Any]:
         "duration": max(span(result), 1e-3),
         "extent": extent(spots, drawn),
         "track": track,
-        "beacons": [_beacon(b, result.beacon_tracks.get(b.id)) for b in result.beacons],
+        "beacons": [beacon(b, 4, result.beacon_tracks.get(b.id)) for b in result.beacons],
         "scan": [numbers(point, 3) for point in result.scan_points],
         "map": drawn,
         "diagnostics": diagnostics(result),
@@ -77,15 +77,15 @@ def page_data(result: Result) -> dict[str, Any]:
     }
 
 
-def _beacon(beacon: BeaconEstimate, path: np.ndarray | None) -> dict[str, Any]:
-    x, y = numbers(beacon.position, 4)
-    cov = beacon.cov
-    out = {"id": beacon.id, "status": beacon.status, "x": x, "y": y, "track": None}
-    out["cov"] = numbers(np.array([cov[0, 0], cov[0, 1], cov[1, 1]]), 8)
+def beacon(estimate: BeaconEstimate, digits: int, path: np.ndarray | None = None) -> dict[str, Any]:
+    """A beacon as the page draws it, to some digits of a metre; path: rows (n, 4) of t, x, y, sigma [s, m]."""
+    x, y = numbers(estimate.position, digits)
+    cov = numbers(estimate.cov.ravel()[[0, 1, 3]], 2 * digits)
+    track = None
     if path is not None and len(path):
         thin = path[:: max(1, len(path) // 500)]
-        out["track"] = {name: numbers(thin[:, k], 4) for k, name in enumerate(("t", "x", "y", "sigma"))}
-    return out
+        track = {name: numbers(thin[:, k], digits) for k, name in enumerate(("t", "x", "y", "sigma"))}
+    return {"id": estimate.id, "status": estimate.status, "x": x, "y": y, "track": track, "cov": cov}
 
 
 def diagnostics(result: Result) -> list[dict[str, Any]]:

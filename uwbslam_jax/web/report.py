@@ -1,6 +1,6 @@
 """A run as one HTML page that opens offline: figures, map with a player, charts and tables.
 
-The page's frame is `page`, its data comes from report_data; here its words and tables are written.
+The page's frame is `page`, its data comes from `page_data`; here its words and tables are written.
 """
 
 from __future__ import annotations
@@ -18,9 +18,8 @@ from uwbslam_jax.result import BeaconStatus, Result, RunStatus
 from uwbslam_jax.web import page
 from uwbslam_jax.web.page_data import diagnostics, page_data, pair_kinds, pair_residuals, span
 
-_PAIRS = 60  # rows of the table of pairs
-
-# name -> label, unit, digits. What is not listed is shown all the same, under its own name.
+_PAIRS = 60
+"""Rows of the table of pairs [pairs]: more than the 45 of ten nodes, and still to be read."""
 _FIGURES: dict[str, tuple[str, str, int]] = {
     "steps": ("Steps", "", 0),
     "duration_s": ("Duration", "s", 1),
@@ -45,8 +44,11 @@ _FIGURES: dict[str, tuple[str, str, int]] = {
     "pose_nees_ratio": ("Pose NEES / dof", "", 2),
     "beacon_nees_ratio": ("Beacon NEES / dof", "", 2),
 }
-_UNITS = ("m", "s", "ms", "deg", "rad", "Hz")  # as the last part of a figure's name
+"""Label, unit and digits of a figure [name -> texts, number]; one that is not listed is shown under its own name."""
+_UNITS = ("m", "s", "ms", "deg", "rad", "Hz")
+"""Units that may be the last part of a figure's name [text], and are shown behind its value instead."""
 _SHOWN_APART = {"config", "warnings", "events", "dropped"}
+"""Parts of the summary that have sections of their own [keys]."""
 
 
 def write_report(
@@ -55,7 +57,7 @@ def write_report(
     """Writes the page.
 
     Args:
-      metrics: errors against the truth where there is one, see metrics.evaluate.
+      metrics: errors against the truth where there is one, see evaluation.evaluate.
       title: heading of the page, plain text.
 
     Shown from result.summary besides plain figures: `warnings` (a list of lines), `truncated` (a line or a flag),
@@ -115,8 +117,8 @@ def _notices(result: Result, metrics: Mapping[str, Any] | None) -> Iterator[tupl
     elif not result.beacons:
         yield "warn", "No beacon was placed."
     if summary.get("truncated"):
-        told = summary["truncated"]
-        yield "warn", told if isinstance(told, str) else "The recording breaks off; it was used up to there."
+        where = summary["truncated"]
+        yield "warn", where if isinstance(where, str) else "The recording breaks off; it was used up to there."
     for text in summary.get("warnings") or []:
         yield "warn", str(text)
     frames = np.diff(result.stamps) / 1e6
@@ -139,37 +141,24 @@ def _tiles(result: Result, metrics: Mapping[str, Any] | None) -> str:
     decided, when = _decided(result)
     at = f"{when:.1f} s" if isinstance(when, int | float) and not isinstance(when, bool) else "yes"
     states = Counter(beacon.status for beacon in result.beacons)
-    summary = {**dict.fromkeys(_FIGURES), **result.summary}
+    known = {**result.summary, **(metrics or {})}
+
+    def shown(name: str) -> str:
+        return page.figure(known.get(name), *_FIGURES[name][1:])
+
     tiles = []
     if metrics is not None:
-        m = {**dict.fromkeys(_FIGURES), **metrics}
         tiles += [
-            (
-                "Robot error, RMS",
-                page.figure(m["robot_rmse_m"], "m", 3),
-                f"largest {page.figure(m['robot_max_m'], 'm', 3)}",
-            ),
-            (
-                "Heading error, median",
-                page.figure(m["heading_deg_median"], "°", 2),
-                f"95 % {page.figure(m['heading_deg_p95'], '°', 2)}",
-            ),
-            (
-                "Beacon error, mean",
-                page.figure(m["beacon_mean_m"], "m", 3),
-                f"largest {page.figure(m['beacon_max_m'], 'm', 3)}",
-            ),
+            ("Robot error, RMS", shown("robot_rmse_m"), f"largest {shown('robot_max_m')}"),
+            ("Heading error, median", shown("heading_deg_median"), f"95 % {shown('heading_deg_p95')}"),
+            ("Beacon error, mean", shown("beacon_mean_m"), f"largest {shown('beacon_max_m')}"),
         ]
     tiles += [
         ("Beacons placed", str(len(result.beacons)), ", ".join(f"{n} {html.escape(s)}" for s, n in states.items())),
         ("Frame decided", html.escape(at) if decided else "not decided", "after the first scan" if at != "yes" else ""),
         ("Driven", page.figure(_driven(result), "m", 1), f"in {page.figure(span(result), 's', 1)}"),
-        (
-            "Step time, median",
-            page.figure(summary["step_ms_median"], "ms", 2),
-            f"95 % {page.figure(summary['step_ms_p95'], 'ms', 2)}",
-        ),
-        ("Real-time factor", page.figure(summary["real_time_factor"], "×", 1), "recorded time over computing time"),
+        ("Step time, median", shown("step_ms_median"), f"95 % {shown('step_ms_p95')}"),
+        ("Real-time factor", shown("real_time_factor"), "recorded time over computing time"),
     ]
     return page.tiles(tiles)
 
@@ -192,34 +181,27 @@ def _sections(result: Result, metrics: Mapping[str, Any] | None) -> str:
     events = [(f"{(event.stamp - start) / 1e9:.2f}", event.text) for event in result.events]
     dropped = summary.get("dropped") or {}
     plain = [_label(key, value) for key, value in summary.items() if key not in _SHOWN_APART]
-    pairs = []
+    none = '<p class="sub">None.</p>'
+    tables = []
     if metrics is not None:
         evaluation = [_label(key, value) for key, value in metrics.items()]
-        pairs.append(page.section("Errors against the truth", page.table((), evaluation, [1])))
-    pairs.append(page.section("Run", page.table((), plain, [1]) if plain else '<p class="sub">No summary.</p>'))
+        tables.append(page.section("Errors against the truth", page.table((), evaluation, [1])))
+    tables.append(page.section("Run", page.table((), plain, [1]) if plain else '<p class="sub">No summary.</p>'))
     counts = [(str(reason).replace("_", " "), page.text(count)) for reason, count in dropped.items()]
-    pairs.append(
-        page.section("Dropped measurements", page.table((), counts, [1]) if counts else '<p class="sub">None.</p>')
-    )
+    tables.append(page.section("Dropped measurements", page.table((), counts, [1]) if counts else none))
+    happened = f'<div class="tall">{page.table(("Time [s]", "What happened"), events, [0])}</div>'
     settings = summary.get("config")
     text = settings if isinstance(settings, str) else _nested(settings or {})
-    return "".join(
-        [
-            page.section("Beacons", page.beacon_table(result.beacons)),
-            _chart_section(result),
-            _residual_section(result),
-            page.section(
-                "Events",
-                f'<div class="tall">{page.table(("Time [s]", "What happened"), events, [0])}</div>'
-                if events
-                else '<p class="sub">None.</p>',
-            ),
-            f'<div class="two">{"".join(pairs)}</div>',
-            f"<section><details><summary>Configuration</summary><pre>{html.escape(text)}</pre></details></section>"
-            if text
-            else "",
-        ]
-    )
+    folded = f"<section><details><summary>Configuration</summary><pre>{html.escape(text)}</pre></details></section>"
+    sections = [
+        page.section("Beacons", page.beacon_table(result.beacons)),
+        _chart_section(result),
+        _residual_section(result),
+        page.section("Events", happened if events else none),
+        f'<div class="two">{"".join(tables)}</div>',
+        folded if text else "",
+    ]
+    return "".join(sections)
 
 
 def _nested(table: Mapping[str, Any], indent: str = "") -> str:

@@ -1,6 +1,6 @@
 """The live view's server: one page, and Server-Sent Events that let it grow. The standard library's HTTP server.
 
-Nothing a viewer sends changes the run. A viewer that does not read fast enough misses events and is told all anew.
+Nothing a viewer sends changes the run. A viewer that reads too slowly misses events and gets all anew.
 """
 
 from __future__ import annotations
@@ -14,11 +14,12 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from uwbslam_jax.errors import UsageError
 from uwbslam_jax.web.live_page import STEP_S, WORDS_S, Event, LivePage
 
-_MOST_VIEWERS = 16
-_WAITING = 50
-"""Events that a viewer may be behind."""
+_MOST_VIEWERS, _WAITING = 16, 50
+"""Viewers at once, each of which takes a thread, and events that one may be behind: some five seconds [each]."""
 _WRITE_TIMEOUT_S = 10.0
+"""A viewer that takes nothing for so long is gone: without this its thread waits for ever [s]."""
 _OWN_NAMES = ("127.0.0.1", "localhost")
+"""This computer's names for itself [host]: under another one, a page of another site would be asking."""
 
 
 def parse_address(text: str) -> tuple[str, int]:
@@ -57,7 +58,7 @@ class LiveView:
             daemon_threads = True
             block_on_close = False
 
-            def handle_error(self, request: object, client_address: object) -> None:  # it is gone: nothing to tell
+            def handle_error(self, request: object, client_address: object) -> None:  # it is gone: nothing to report
                 pass
 
         try:
@@ -66,17 +67,17 @@ class LiveView:
             raise UsageError(f"live view at {host}:{port}: {error.strerror or error}; see --view") from None
         self.url = f"http://{host}:{self._server.server_address[1]}"
         threading.Thread(target=self._server.serve_forever, name="live view", daemon=True).start()
-        self._thread = threading.Thread(target=self._tell, name="live events", daemon=True)
+        self._thread = threading.Thread(target=self._serve, name="live events", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Tells the viewers that the run has ended, and closes the port."""
+        """Reports to the viewers that the run has ended, and closes the port."""
         self._closing.set()
         self._thread.join()
         self._server.shutdown()
         self._server.server_close()
 
-    def _tell(self) -> None:
+    def _serve(self) -> None:
         """Hands events to all viewers."""
         count = 0
         while not self._closing.wait(STEP_S):

@@ -24,7 +24,9 @@ from uwbslam_drivers.source import DEVICES
 from uwbslam_jax.sim import SCENARIOS, Scenario, make_scenario
 
 LOOPBACK = "127.0.0.1"
+"""Host where emulators listen by default [host]: nothing outside this computer reaches them."""
 _LOOK = 0.2
+"""Time between two looks at whether somebody listens, or all is over [s]: short to a person."""
 
 
 @dataclass

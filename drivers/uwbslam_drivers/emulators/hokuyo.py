@@ -16,10 +16,10 @@ from uwbslam_jax.measurements import ScanMessage
 from uwbslam_jax.sim import Scenario
 
 PROCESSING = 1 * MS
-"""A reply follows the last beam after this time [ns]."""
-NO_RETURN = 1
-"""Error code of a beam that meets nothing."""
-INTENSITY = 3000
+"""A reply follows the last beam after this time: no sensor answers at once [ns]."""
+NO_RETURN, INTENSITY = 1, 3000
+"""Error code of a beam that meets nothing [mm], and the intensity of every other beam [dimensionless], which no driver
+uses."""
 
 
 @dataclass

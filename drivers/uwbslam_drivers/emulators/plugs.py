@@ -10,8 +10,8 @@ import time
 import tty
 from pathlib import Path
 
-_SEND_TIMEOUT = 0.5
-_POLL = 0.02
+_SEND_TIMEOUT, _POLL = 0.5, 0.02
+"""A program that reads nothing for so long is disconnected; a terminal without one is looked at so often [s]."""
 
 
 class TcpPlug:
@@ -101,7 +101,7 @@ class PtyPlug:
         os.set_blocking(self._master, False)
         self._link.unlink(missing_ok=True)
         self._link.symlink_to(os.ttyname(slave))
-        os.close(slave)  # now the terminal tells whether a program has it open
+        os.close(slave)  # now the terminal shows whether a program has it open
 
     def pull(self) -> None:
         """The terminal and its name are gone."""

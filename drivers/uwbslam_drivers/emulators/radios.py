@@ -13,9 +13,9 @@ from uwbslam_jax.measurements import RangeMessage
 from uwbslam_jax.sim import Scenario
 
 PROCESSING = 1_000_000
-"""A range is sent after this time [ns]."""
+"""A range is sent after this time: no radio answers at once [ns]."""
 TAG, ANCHOR = 2, 1
-"""Roles of LinkTrack."""
+"""Roles of LinkTrack [one byte] (NLink protocol)."""
 
 
 class Radio:
@@ -79,11 +79,11 @@ class EmulatedLinkTrack(Radio):
     """A tag that sends NodeFrame2; the system time of each range in it."""
 
     protocol = "linktrack"
-    _mark, _fixed = linktrack.FRAME2, linktrack.FIXED2
+    _mark, _fixed, _layout = linktrack.FRAME2, linktrack.FIXED2, linktrack.NODE2
 
     def encode(self, messages: list[RangeMessage], departure: int) -> bytes:
         system = [self._clock(robot.host_stamp(m.stamp, departure)) for m in messages]
-        length = self._fixed + len(messages) * self._node_size() + 1
+        length = self._fixed + len(messages) * self._layout.size + 1
         fixed = bytearray(self._fixed)
         fixed[0:6] = self._mark + length.to_bytes(2, "little") + bytes([TAG, messages[0].source & 0xFF])
         self._times(fixed, system[-1])
@@ -95,29 +95,23 @@ class EmulatedLinkTrack(Radio):
     def _clock(self, host: int) -> int:
         return self.time.at(host) % linktrack.WRAP // linktrack.MS
 
-    def _node_size(self) -> int:
-        return linktrack.NODE2.size
-
     def _times(self, fixed: bytearray, system: int) -> None:
         fixed[6:10] = system.to_bytes(4, "little")
 
     def _node(self, message: RangeMessage, system: int) -> bytes:
-        return linktrack.NODE2.pack(*_node_fields(message), system)
+        return self._layout.pack(*_node_fields(message), system)
 
 
 class EmulatedLinkTrack3(EmulatedLinkTrack):
     """A tag that sends NodeFrame3; one system time for all of its ranges, that of the last."""
 
-    _mark, _fixed = linktrack.FRAME3, linktrack.FIXED3
-
-    def _node_size(self) -> int:
-        return linktrack.NODE3.size
+    _mark, _fixed, _layout = linktrack.FRAME3, linktrack.FIXED3, linktrack.NODE3
 
     def _times(self, fixed: bytearray, system: int) -> None:
         fixed[6:14] = 2 * system.to_bytes(4, "little")
 
     def _node(self, message: RangeMessage, system: int) -> bytes:
-        return linktrack.NODE3.pack(*_node_fields(message))
+        return self._layout.pack(*_node_fields(message))
 
 
 def _node_fields(message: RangeMessage) -> tuple[int, int, bytes, int, int]:
@@ -127,7 +121,7 @@ def _node_fields(message: RangeMessage) -> tuple[int, int, bytes, int, int]:
 
 
 class EmulatedDwm1001(Radio):
-    """A module whose shell has to be entered and told `lec`."""
+    """A module whose shell has to be entered and given the command `lec`."""
 
     protocol = "dwm1001"
 

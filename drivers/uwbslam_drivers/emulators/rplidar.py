@@ -12,12 +12,11 @@ from uwbslam_drivers.emulators.robot import DeviceTime
 from uwbslam_jax.sim import Scenario, cast, stream
 
 RATE = 10.0
-"""Turns a second."""
+"""Turns a second of an A2 by default [Hz]."""
 STANDARD, EXPRESS = 500, 250
-"""Time of a sample [us]."""
-REACH = 12.0
-SIGMA = 0.01
-_SAMPLES = protocol.SAMPLES
+"""Time of a sample [us]: what an A2 answers to GET_SAMPLERATE (LR001)."""
+REACH, SIGMA = 12.0, 0.01
+"""Farthest return of an A2, and the standard deviation of a distance [m]."""
 
 
 class Samples(NamedTuple):
@@ -46,10 +45,10 @@ class EmulatedRplidar:
         t = 0.0
         while t < scenario.duration:
             period = (STANDARD if self._mode == "standard" else EXPRESS) * 1e-6
-            times = t + period * np.arange(_SAMPLES)
-            t += period * _SAMPLES
+            times = t + period * np.arange(protocol.SAMPLES)
+            t += period * protocol.SAMPLES
             angles = 360.0 * RATE * times % 360.0
-            distances = _distances(scenario, times, RATE) + SIGMA * noise.normal(size=_SAMPLES)
+            distances = _distances(scenario, times, RATE) + SIGMA * noise.normal(size=protocol.SAMPLES)
             seen = (distances > protocol.RANGE_MIN) & (distances < REACH)
             yield round(t * 1e9), Samples(angles, np.where(seen, distances, 0.0))
 

@@ -23,6 +23,7 @@ from uwbslam_drivers.emulators.rplidar import EmulatedRplidar
 from uwbslam_jax.sim import Scenario, stream
 
 _POLL = 0.02
+"""A device that nothing is due of listens so long for a request: what it says then is at most so late [s]."""
 
 
 class EmulatedDevice(Protocol):
@@ -61,7 +62,7 @@ EMULATORS: Mapping[str, Callable[[DeviceTime], EmulatedDevice]] = {
     "dwm1001": EmulatedDwm1001,
     "makerfabs": EmulatedMakerfabs,
 }
-"""Every emulated device by name."""
+"""Every emulated device [name -> what makes one with its clock]."""
 
 
 class Server:
