@@ -272,7 +272,7 @@ class TestSimulation:
     def test_a_run_needs_nothing_else(self) -> None:
         simulation = us.simulate("lever_arms", 3, 2.0, beams=61)
         result = us.run(simulation)
-        assert result.summary["config"]["robot"]["antenna"] == list(simulation.settings.robot.antenna)
+        assert result.summary["config"]["robot"]["antenna"] == simulation.settings.robot.antenna
         assert result.summary["steps"] == len(result.stamps) == 20
         assert result.truth is not None
         np.testing.assert_array_equal(result.truth.robot, simulation.truth.robot)
