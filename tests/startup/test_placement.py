@@ -18,7 +18,9 @@ from uwbslam_jax.startup.placement import Problem
 
 
 def problem(poses=None, **options) -> Problem:
-    return Problem.build(start_of_run.buffer(start_of_run.with_a_turn() if poses is None else poses, **options))
+    found = Problem.build(start_of_run.buffer(start_of_run.with_a_turn() if poses is None else poses, **options))
+    assert found is not None
+    return found
 
 
 def truth() -> np.ndarray:
