@@ -112,7 +112,9 @@ class History:
         for k, (frame, estimate) in enumerate(seen):
             self._follow(first + k, frame, estimate)
 
-    def _add_residuals(self, stamps: list[int], used: np.ndarray, i, j, innovation) -> None:
+    def _add_residuals(
+        self, stamps: list[int], used: np.ndarray, i: np.ndarray, j: np.ndarray, innovation: np.ndarray
+    ) -> None:
         columns = (np.nonzero(used)[0], i[used], j[used], innovation[used])
         for frame, *pair, residual in zip(*(column.tolist() for column in columns), strict=True):
             stamp, pair = stamps[frame], tuple(pair)
