@@ -68,6 +68,7 @@ class Config:
       cells: cells along the window's side at the finest level.
       nlos_gap_db: power rule [dB].
       preset, scan_matching, correction, lidar_only: see FilterSettings.
+      draws: whether scans are drawn; not in a run that only localises.
     """
 
     nodes: int
@@ -81,6 +82,7 @@ class Config:
     scan_matching: bool
     correction: bool
     lidar_only: bool
+    draws: bool = True
 
 
 @dataclass(frozen=True)

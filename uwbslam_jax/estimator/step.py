@@ -193,6 +193,8 @@ def _draw(config: Config, state: State, matched: _Matched, view: View) -> tuple[
 
     New ground is drawn at a known place, so what the map errs by there is known to be the pose's own error.
     """
+    if not config.draws:
+        return state, jnp.zeros((), bool)
     pose, sweep = matched.match.pose, view.sweep
     moved = jnp.hypot(*(pose[:2] - state.drawn_pose[:2])) > _DRAW_MOVED[0]
     turned = jnp.abs(wrap_angle(pose[2] - state.drawn_pose[2])) > _DRAW_MOVED[1]

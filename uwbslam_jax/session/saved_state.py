@@ -139,13 +139,10 @@ def resumed(saved: Saved, place: np.ndarray, *, fixed: bool) -> State:
 
 
 def _pinned(state: State) -> State:
-    """The state with beacons that ranges do not move, and a map that is not drawn on: no pose is far from NaN."""
+    """The state with beacons that ranges do not move."""
     slots = np.flatnonzero(np.asarray(state.active))[1:]
-    own = np.concatenate([[2 * slot, 2 * slot + 1] for slot in slots]).astype(int) if len(slots) else np.zeros(0, int)
+    own = (2 * slots[:, None] + np.arange(2)).ravel()
     P = np.array(state.belief.cov)
     P[own, :] = P[:, own] = 0.0
     P[own, own] = _PINNED_M**2
-    nowhere = jnp.full(3, jnp.nan, jnp.float32)
-    enough = jnp.maximum(state.scans_drawn, 1000)
-    belief = Gaussian(state.belief.mean, jnp.asarray(P, jnp.float32))
-    return state._replace(belief=belief, drawn_pose=nowhere, scans_drawn=enough)
+    return state._replace(belief=Gaussian(state.belief.mean, jnp.asarray(P, jnp.float32)))

@@ -155,7 +155,7 @@ class Session:
         self.tiles, self._slots = saved.tiles.copy(), dict(saved.slots)
         self.found_bias, self.fixed = dict(saved.found_bias), fixed
         self.history.event(stamp, EventKind.LOCALISING if fixed else EventKind.RESUMED)
-        self.config = make_config(self.settings)
+        self.config = dataclasses.replace(make_config(self.settings), draws=not fixed)
         self.params = make_params(self.settings, self._slots, self.found_bias)
         self.decided_at, self.status, self.hypotheses = stamp, RunStatus.DECIDED, 1
         self.back_end.enabled = False  # the scans that the saved map was drawn from are gone
