@@ -69,6 +69,7 @@ _HOME = {
 }
 """Module or wing -> the names that it gives to the front door; a test holds it to the imports above."""
 _PLACE = {name: f"uwbslam_jax.{module}" for module, names in _HOME.items() for name in names.split()}
+"""Name -> full name of its module."""
 
 __all__ = ["__version__", "estimator", *_PLACE]
 

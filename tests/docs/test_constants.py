@@ -38,6 +38,5 @@ def test_takes_constants_with_the_docstring_that_follows(maker: ModuleType) -> N
     ]
 
 
-@pytest.mark.xfail(reason="docstrings of constants are still missing; strict, so that the mark goes with the last one")
 def test_every_constant_has_its_unit_and_reason(maker: ModuleType) -> None:
     assert maker.without_docstring() == []

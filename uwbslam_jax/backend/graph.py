@@ -30,8 +30,7 @@ _TURN_M = 1.0
 """A turn of one radian makes two scans see as little of the same as so much way [m]."""
 _REACH_M = 10.0
 """Anchors farther off are not tried."""
-_NEAREST = 2
-_TIES = 2 + _NEAREST
+_NEAREST, _TIES = 2, 4
 """A scan is laid over the one before, the nearest anchors, and the oldest one in reach."""
 _SHARE = 0.5
 """Share of a scan's surfaces that have to lie on those of the older one."""
@@ -43,8 +42,7 @@ _FOUND_S = 5.0
 """A robot that was carried is found within so long."""
 _VIEWS = 64
 """Scans that were last laid over others are kept ready for the next: 3 MB."""
-_SCANS_OF_A_PLACE = 8
-_PLACE = (1.5, 0.8)
+_SCANS_OF_A_PLACE, _PLACE = 8, (1.5, 0.8)
 """Scans taken so near to each other see the same [m, rad]; more than so many of them tell nothing new."""
 _MM = 1000.0
 """Scans are kept in whole millimetres."""

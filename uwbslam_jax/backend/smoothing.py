@@ -33,8 +33,10 @@ _STAGES = (Stage(soft=1000.0, coarse=4.0), Stage(soft=30.0, coarse=2.0), Stage(s
 """One solution after the other. The filter's track may be far off for what two scans tell, and nothing must be an
 outlier only because the start is wrong."""
 _FEWEST_MEANS = 6
-_MOVES = 25
-_ENOUGH = 0.05
+"""A resting place that was ranged less takes no part: fewer averages leave more than one place for it."""
+_MOVES, _ENOUGH = 25, 0.05
+"""Moves of a stage at most [moves]: a bound for starts far off; one that gains less log-likelihood than this is the
+last."""
 
 
 class Solution(NamedTuple):

@@ -25,6 +25,7 @@ from uwbslam_jax.numerics import (
 )
 
 TIME, OTHER, X, Y, DISTANCE, NORMALISED = range(6)
+"""Columns of a sighting: when [s], the other node, where that was [m], distance [m], normalised innovation."""
 MEMORY_S = 40.0
 """Rows are kept this long."""
 _WINDOWS_S = (40.0, 20.0, 10.0, 5.0, 2.0)
@@ -35,14 +36,16 @@ _HEADING_WALK = 0.002
 """Random walk of the heading error of the robot's own track with its way [rad/m^0.5]."""
 _TRACK_FLOOR_M = 0.05
 """What that comes to in a velocity, which is seen over some seconds."""
-_FEWEST_ROWS = 12
-_FEWEST_GROUPS = 3
+_FEWEST_ROWS, _FEWEST_GROUPS = 12, 3
+"""Rows and groups that a fit needs: a velocity has four unknowns, and a wrong range must show."""
 _SPEED_SIGMA = 0.1
 """A node is known to rest when its velocity is known this well and is not different from zero [m/s]."""
 _SLOW = 0.02
-_RECENT_S = 1.0
-_FEWEST_JUDGED = 5
+"""A velocity this small is none: the robot's own track drifts as fast [m/s]."""
+_RECENT_S, _FEWEST_JUDGED = 1.0, 5
+"""A node is judged by the ranges of the last second [s], and by no fewer than this."""
 _CARRIED_SIGMA_M = 0.3
+"""A carried node is followed from a place that is known this well: the filter is linear within it [m]."""
 _WALL_COST = 6.0
 """Log-likelihood that it costs to say that a wall has come between two nodes."""
 _WALL_M = 3.0

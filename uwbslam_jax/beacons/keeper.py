@@ -32,8 +32,8 @@ from uwbslam_jax.estimator import Changes, Estimate, HostView, SlotEvent, State,
 from uwbslam_jax.numerics import locate
 from uwbslam_jax.result import BeaconStatus, EventKind
 
-_SILENT_S = 3.0
-_DROP_S = 60.0
+_SILENT_S, _DROP_S = 3.0, 60.0
+"""A beacon is silent, and dropped, when it was not heard for so long [s]: behind a wall for a while, or gone."""
 _SILENT_WALK = 0.01
 """Random walk of the place of a beacon that is not heard: somebody may push it [m/s^0.5]."""
 _DOUBTED_S = 5.0
@@ -44,21 +44,19 @@ _WATCHED_S = 2.0
 """Of a beacon whose ranges fit, so much is remembered."""
 _MISFIT = 4.0
 """Median absolute normalised innovation of a node's ranges to the robot beyond which they do not fit."""
-_CARRIED_SHARE = 0.4
-_FOUND_SHARE = 0.7
+_CARRIED_SHARE, _FOUND_SHARE = 0.4, 0.7
 """When the robot's ranges to so many of the beacons stop fitting at once, and one other place explains so many of
 them, it is the robot that was carried. The filter may have settled where two or three of them fit by chance."""
-_CARRIED_S = 0.5
-_CARRIED_M = 0.5
-"""A robot that was carried less far finds itself by its scans."""
-_FITTING_SCORE = 0.7
-_CONTRADICTED_S = 3.0
+_CARRIED_S, _CARRIED_M = 0.5, 0.5
+"""Of the ranges of so long a time [s]; a robot that was carried less far finds itself by its scans [m]."""
+_FITTING_SCORE, _CONTRADICTED_S = 0.7, 3.0
 """Where the scans fit, the ranges must speak against them for so long: ranges through walls and biases do so at times,
 but not from one other place for long."""
 _NEWEST = 4
 """So many of a beacon's newest ranges place a robot that was carried."""
 
 _WATCHED = (BeaconStatus.STATIC, BeaconStatus.MOVING, BeaconStatus.SILENT)
+"""Of a beacon that is in the state its ranges are judged."""
 
 
 @dataclass

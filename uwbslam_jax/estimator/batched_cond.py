@@ -11,6 +11,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Int
 
 T = TypeVar("T")
+"""A tree of arrays."""
 
 
 def seldom(wanted: Bool[Array, ""], costly: Callable[..., T], old: T, *operands: Any) -> T:

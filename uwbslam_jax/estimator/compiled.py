@@ -24,6 +24,7 @@ from uwbslam_jax.measurements import Frame, empty_frame
 from uwbslam_jax.settings import Config, Params, Settings, UwbSettings, make_params
 
 T = TypeVar("T")
+"""A tree of arrays."""
 
 TRACES: Counter[str] = Counter()
 """How often each compiled function was traced, by name; a test counts them."""

@@ -30,8 +30,7 @@ from uwbslam_jax.settings import Settings
 
 _SCANLESS_S = 1.0
 """Ranges wait this long for a scan before they make a frame of their own."""
-_BLIND_S = 0.2
-_BLIND_SCANS = 2
+_BLIND_S, _BLIND_SCANS = 0.2, 2
 """Once a LiDAR has fallen silent they wait only so long, or so many of its usual intervals where those are longer: no
 velocity predicts a turning robot for a second, but a slow scanner is not a silent one."""
 _INTERVALS = 9

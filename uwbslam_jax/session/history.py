@@ -17,8 +17,7 @@ from uwbslam_jax.result import Event, EventKind
 _RESIDUALS_EVERY_S = 1.0
 """Of each pair one is kept this often: frames at fixed times would see the same pairs again and again, or none."""
 _TRACK_EVERY_S = 1.0
-
-
+"""A beacon's track is for looking at: one point a second of it [s]."""
 _DIAGNOSTICS = np.dtype(
     [
         ("match_score", np.float32),
@@ -34,8 +33,11 @@ _DIAGNOSTICS = np.dtype(
         ("ranges_doubted", np.uint16),
     ]
 )
+"""Of a frame: scores and shares [0 to 1], truth values, and counts."""
 _RESIDUAL = np.dtype([("stamp", np.int64), ("i", np.int32), ("j", np.int32), ("residual", np.float32)])
+"""A range's stamp [ns], slots, and measured less predicted range [m]."""
 _TRACK = np.dtype([("stamp", np.int64), ("slot", np.int32), ("x", np.float32), ("y", np.float32), ("s", np.float32)])
+"""Rows of stamps [ns], slots, and lengths [m]."""
 
 
 class History:

@@ -20,8 +20,11 @@ from uwbslam_jax.session.update import scan_points
 from uwbslam_jax.startup import Relative
 
 _NO_SCAN = "no scan: the track is that of odometry and ranges, the map is empty"
+"""Warning [text]."""
 _NO_TRACK = "no scan and no odometry: there is no track, the map is empty"
+"""Warning [text]."""
 _RELATIVE = "the robot has not moved: beacons are placed among themselves, rotation and reflection are arbitrary"
+"""Warning [text]."""
 
 
 @dataclass

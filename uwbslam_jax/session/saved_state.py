@@ -25,8 +25,8 @@ from uwbslam_jax.measurements import RangeMessage
 from uwbslam_jax.numerics import Gaussian, locate
 from uwbslam_jax.settings import Settings, make_config, make_host_params, make_params
 
-FILE = "state.npz"
-_VERSION = 1
+FILE, _VERSION = "state.npz", 1
+"""Name of a saved state in a run's folder, and of what it holds [number]: another one is refused."""
 _WINDOW_S = 0.5
 """The robot is placed by the ranges of so long a time; it may drive meanwhile."""
 _FEWEST = 3

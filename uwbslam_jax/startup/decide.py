@@ -21,12 +21,12 @@ from uwbslam_jax.startup.keyframe_buffer import Buffer
 from uwbslam_jax.startup.placement import Placement, Problem
 
 _MOVED_ENOUGH_M = 1.0
+"""A robot that has not moved so far is waited for: over less, the noise of the ranges hides the directions [m]."""
 _BIAS_M = 0.3
 """Prior spread of a node's range bias once ranges do not look calibrated [m]."""
 _HEADING_ENOUGH = 0.026
 """Start-up ends when the robot's heading among the beacons is known this well [rad]."""
-_UNDRAWN_HEADING = 0.15
-_UNDRAWN_SIGMA = 0.05
+_UNDRAWN_HEADING, _UNDRAWN_SIGMA = 0.15, 0.05
 """The same without a map [rad], and for positions as a share of the distance between beacons."""
 _UNDRAWN_WAIT_S = 60.0
 """Without a map so long is waited for beacons that are not yet certain: placed together they are placed best."""

@@ -15,15 +15,14 @@ import numpy as np
 from uwbslam_jax.numerics import multilaterate, rotation_matrix, scaled, soften, turned
 from uwbslam_jax.startup.placement import Placement, Problem
 
-_ANGLES = 72
-_WAYS = 2
-"""So many ways of laying the ranges' geometry on the track are tried, for each reflection."""
+_ANGLES, _WAYS = 72, 2
+"""Angles that are looked at, one every 5 degrees; so many ways of laying the ranges' geometry on the track are tried,
+for each reflection."""
 _PATH_SIGMA = 0.07
 """How well ranges place the robot between beacons that are known [m]."""
 _SIDES = 3
 """So many choices of the sides are tried."""
-_TRY_ALL = 10
-_TRIALS = 16
+_TRY_ALL, _TRIALS = 10, 16
 """Of more beacons than so many not all choices are looked at, but those that so many random ones lead to."""
 _SAME_M = 0.3
 """Beacons closer than this are the same place."""

@@ -30,14 +30,13 @@ from uwbslam_jax.settings import HostParams
 
 _MOVED = (0.25, 0.2)
 """A keyframe every so much of path or turn [m, rad]."""
-_BLIND_S = 0.5
-_BLIND_M = 0.3
+_BLIND_S, _BLIND_M = 0.5, 0.3
 """A keyframe also after this time where the scan cannot tell the position to this standard deviation: the track then
 says little about how far the robot has moved."""
 _MOST_KEYFRAMES = 64
 """A longer start is thinned: every other keyframe goes."""
-_MOST_SIGHTINGS = 3000
-_MOST_OF_PAIR = 400
+_MOST_SIGHTINGS, _MOST_OF_PAIR = 3000, 400
+"""Ranges that are kept, of the robot to a beacon and of two beacons: a minute at 50 Hz; more only fill memory."""
 _LATEST = 42
 """So many of a pair's newest ranges tell how much they scatter when start-up ends."""
 

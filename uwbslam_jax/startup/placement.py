@@ -37,6 +37,7 @@ _LONGEST_S = 3.0
 _DRIFT = (0.005, 0.01, 0.002, 0.003)
 """The same of what the map that a scan is matched with drifts on the step."""
 _MOST_MOVES = 20
+"""Of a stage at most [moves]: a bound on the time of a solve from a wrong hypothesis."""
 _STAGES = (Stage(soft=np.inf, coarse=8.0), Stage(soft=np.inf, coarse=1.0))
 """The problem is solved twice: first a range may err by so many times as much, or where the start is wrong by more than
 the radio errs all its ranges were outliers, and a beacon could as well be anywhere."""

@@ -32,6 +32,7 @@ _SOFT_M = 0.1
 _IN_SIGHT_SHARE = 0.25
 """A link of which at least so many ranges are in line of sight by their powers goes by those alone."""
 _RANDOM_STARTS = 8
+"""Where pairs are missing the scaled start may be folded: one of so many others is not."""
 _OFFSET_SHARES = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98)
 """Starts of an unknown common offset, as shares of the shortest range."""
 
