@@ -25,7 +25,7 @@ from uwbslam_jax.numerics import (
 )
 
 TIME, OTHER, X, Y, DISTANCE, NORMALISED = range(6)
-"""Columns of a sighting: when [s], the other node, where that was [m], distance [m], normalised innovation."""
+"""Columns of a sighting: when [s], the other node, where it was [m], distance [m], normalised innovation."""
 MEMORY_S = 40.0
 """Rows are kept this long."""
 _WINDOWS_S = (40.0, 20.0, 10.0, 5.0, 2.0)
