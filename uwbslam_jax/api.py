@@ -207,6 +207,7 @@ class Slam:
         self.on_update = on_update
         self._goes_on = _saved(resume, localize, self.settings)
         self._held: list[Message] = []
+        self._due: list[Update] = []
         self._clock, self._begin = CompileClock(), 0.0
         self._end = contextlib.ExitStack()
         self._end.enter_context(self._clock)
@@ -226,7 +227,8 @@ class Slam:
             scans = sum(isinstance(m, ScanMessage) for m in self._held)
             late = message.stamp - self._held[0].stamp > _PEEK_S * 1e9
             return self._release() if scans >= PEEK_SCANS or late else []
-        return self._runner.add(message)
+        due, self._due = self._due, []
+        return due + self._runner.add(message)
 
     def _release(self) -> list[Update]:
         """What was held goes in."""
@@ -239,7 +241,7 @@ class Slam:
     def runner(self) -> Runner:
         """What does the work."""
         if self._runner is None:
-            self._release()
+            self._due = self._release()  # handed over with the next message
         assert self._runner is not None
         return self._runner
 

@@ -1,4 +1,4 @@
-"""Preset "paper": errata 1-3 of DESIGN 1.6, each against the form that is printed."""
+"""Preset "paper": errata 1-3 of docs/estimator.md, each against the form that is printed."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ def test_on_a_straight_path_the_reflection_is_undecided(seed):
     outcome = solved(start_of_run.straight(), seed=seed, antenna=(0.0, 0.0))
     assert outcome.status == "reflection undecided"
     assert outcome.hypotheses == 2
-    assert outcome.margin < 3.0  # DESIGN 1.7: 0.5-3 on a straight path
+    assert outcome.margin < 3.0  # 0.5 to 3 on a straight path
     assert outcome.placement is None
 
 

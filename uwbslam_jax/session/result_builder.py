@@ -189,7 +189,7 @@ def _frame_beacons(session: Session) -> list[int]:
 
 
 def _summary(session: Session, facts: Facts) -> dict[str, Any]:
-    """The content of summary.json, see DESIGN; without evaluation figures.
+    """The content of summary.json, without evaluation figures.
 
     The real-time factor is the recording's duration over the time taken, compilation left out.
     """

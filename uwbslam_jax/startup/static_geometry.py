@@ -1,4 +1,4 @@
-"""Where nodes at rest stand among themselves, from the ranges between them alone (DESIGN 1.7, "while the robot rests").
+"""Where nodes at rest stand among themselves, from the ranges between them alone while the robot rests.
 
 Ranges fix such a geometry up to translation, rotation and reflection; the frame is made by convention. Host code in
 float64: nothing here moves, reads a file or knows the estimator's state.
