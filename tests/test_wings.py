@@ -220,7 +220,6 @@ def test_few_functions_have_many_arguments() -> None:
     assert len(many) <= FUNCTIONS_WITH_MANY, "\n".join(many)
 
 
-@pytest.mark.xfail(strict=True, reason="3 have no annotation")
 def test_every_argument_is_annotated() -> None:
     found = functions([path for path in MODULES if wing_of(path) in ANNOTATED])
     bare = [f"{name}: {arg.arg}" for name, arguments in found for arg in arguments if arg.annotation is None]

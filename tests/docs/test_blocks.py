@@ -86,6 +86,7 @@ def _to_run(path: Path) -> list[Block]:
     return [b for b in _of(path) if b.language in RUN and b.why_not is None]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", [path for path in PAGES if _to_run(path)], ids=_name)
 def test_runs(path: Path, folder: Path, run: Run) -> None:
     """Blocks run in their order in one folder, each in a process of its own, as they are copied one by one."""

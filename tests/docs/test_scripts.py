@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 from pathlib import Path
 
 import pytest
@@ -24,8 +23,8 @@ MADE = {
 }
 """Script -> the files that it writes. The first one only makes arrays for another."""
 
-GRADIENT_S = 60.0
-"""What the gradient may take, compilation included [s of CPU: others may use the machine at the same time]."""
+LONG = {"gradient", "tune", "seeds", "compare"}
+"""These compile derivatives or batches, or run more than once."""
 
 
 def test_every_script_is_listed_and_shown() -> None:
@@ -40,22 +39,13 @@ def test_has_at_most_ten_lines_of_code(name: str) -> None:
     assert len([line for line in lines if line and not line.startswith("#")]) <= 10
 
 
-@pytest.mark.parametrize("name", MADE)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in LONG else n for n in MADE])
 def test_runs(name: str, folder: Path, run: Run) -> None:
     if name == "own_arrays":
         run("python", SCRIPTS / "make_arrays.py", cwd=folder)
-    before = _cpu_seconds()
     done = run("python", SCRIPTS / f"{name}.py", cwd=folder)
     assert [path for path in MADE[name] if not (folder / path).is_file()] == []
     assert "nan" not in done.stdout.split()  # no figure is missing
     assert done.stdout or MADE[name]
     if name == "own_arrays":
         assert "decided" in done.stdout  # the arrays are enough for a frame
-    if name == "gradient":
-        assert _cpu_seconds() - before < GRADIENT_S
-
-
-def _cpu_seconds() -> float:
-    """Of all processes that have ended so far [s]."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime

@@ -10,7 +10,7 @@ import pytest
 import start_of_run
 from start_of_run import BEACONS, IDS, SETTINGS
 
-from uwbslam_jax.estimator import init, state_vector
+from uwbslam_jax.estimator import HostView, init, state_vector
 from uwbslam_jax.mapping.tiled_map import Tiles
 from uwbslam_jax.numerics import TrackRanges, median_range, se2, se2_host
 from uwbslam_jax.settings import make_config, make_host_params, make_params
@@ -92,8 +92,10 @@ def adopted_case():
     cov[np.ix_(at, at)] = MOTION_COV
     state = state._replace(belief=state.belief._replace(mean=mean, cov=jnp.asarray(cov)))
     frame_slots = decide.choose_frame(outcome.placement, IDS)
-    adopted = adopt(CONFIG, PARAMS, state, Tiles(CONFIG.resolution), kept, outcome.placement, frame_slots)
-    return outcome.placement, state, frame_slots, adopted, pose
+    nothing = Tiles(CONFIG.resolution), {}, [], np.zeros((0, 3)), {}, {}
+    view = HostView(CONFIG, PARAMS, kept.host, state, *nothing)
+    adopted, _, moved = adopt(view, kept, outcome.placement, frame_slots)
+    return outcome.placement, state, frame_slots, adopted, moved, pose
 
 
 def published(x: np.ndarray, onward: np.ndarray, frame: tuple[int, int]) -> np.ndarray:
@@ -111,16 +113,16 @@ def published(x: np.ndarray, onward: np.ndarray, frame: tuple[int, int]) -> np.n
 
 
 def test_adopted_state_is_the_start_in_the_published_frame():
-    placement, state, frame, adopted, pose = adopted_case()
+    placement, state, frame, adopted, _, pose = adopted_case()
     onward = se2_host.between(_last_key(), pose)
     want = published(np.concatenate([placement.poses[-1], placement.beacons.ravel()]), onward, frame)
-    s = state_vector.unpack(adopted.state.belief.mean)
+    s = state_vector.unpack(adopted.belief.mean)
     np.testing.assert_allclose(s.positions[0], want[:2], atol=1e-4)  # float32 of some metres
     np.testing.assert_allclose(np.exp(1j * float(s.heading)), np.exp(1j * want[2]), atol=1e-5)
     np.testing.assert_allclose(s.positions[1:], want[3:].reshape(-1, 2), atol=1e-5)
     np.testing.assert_allclose(s.positions[frame[0]], 0.0, atol=1e-6)
     assert float(s.positions[frame[1], 0]) > 0
-    np.testing.assert_array_equal(adopted.state.active, True)
+    np.testing.assert_array_equal(adopted.active, True)
     # the velocity turns with the frame: the same speed, the same angle against the heading
     v, before = np.asarray(s.velocities[0]), np.array([0.3, 0.7])
     np.testing.assert_allclose(np.hypot(*v), np.hypot(*before), rtol=1e-6)
@@ -134,7 +136,7 @@ def _last_key() -> np.ndarray:
 
 
 def test_adopted_covariance_is_that_of_samples_put_through_the_change_of_frame():
-    placement, _, frame, adopted, pose = adopted_case()
+    placement, _, frame, adopted, _, pose = adopted_case()
     n = placement.poses.size
     x = np.concatenate([placement.poses[-1], placement.beacons.ravel()])
     cov = placement.cov[n - 3 :, n - 3 :]
@@ -143,7 +145,7 @@ def test_adopted_covariance_is_that_of_samples_put_through_the_change_of_frame()
     samples = np.random.default_rng(0).multivariate_normal(x, cov / 100, 4000)
     mapped = np.array([published(sample, onward, frame) for sample in samples])
     want = 100 * np.cov(mapped.T)
-    P = np.asarray(adopted.state.belief.cov)
+    P = np.asarray(adopted.belief.cov)
     nodes = CONFIG.nodes
     at = [*state_vector.pose_indices(nodes), *range(2, 2 * nodes)]
     # a sample covariance of 4000 is right to 2.2 % of each pair's spread; four times that
@@ -161,27 +163,27 @@ def test_adopted_covariance_is_that_of_samples_put_through_the_change_of_frame()
 
 
 def test_covariance_of_the_velocity_turns_with_the_frame():
-    _, _, _, adopted, pose = adopted_case()
-    turn = float(state_vector.unpack(adopted.state.belief.mean).heading) - pose[2]
+    _, _, _, adopted, _, pose = adopted_case()
+    turn = float(state_vector.unpack(adopted.belief.mean).heading) - pose[2]
     J = np.eye(3)
     J[:2, :2] = se2_host.rotation_matrix(turn)
-    P = np.asarray(adopted.state.belief.cov)
+    P = np.asarray(adopted.belief.cov)
     np.testing.assert_allclose(P[np.ix_(MOTION, MOTION)], J @ MOTION_COV @ J.T, atol=1e-6)  # float32
 
 
 def test_earlier_poses_are_republished_with_the_keyframes_around_them():
-    placement, _, _, adopted, _ = adopted_case()
+    placement, _, _, _, moved, _ = adopted_case()
     track = start_of_run.with_a_turn()
-    np.testing.assert_allclose(adopted.republish(adopted.anchors, track), adopted.after, atol=1e-9)
+    np.testing.assert_allclose(moved.carry(moved.anchors, track), moved.after, atol=1e-9)
     # a pose between two keyframes keeps its place relative to both, the nearer one counting more
     later = (track[3] + np.array([0.1, 0.02, 0.05]))[None]
-    quarter = adopted.anchors[3:4] + (adopted.anchors[4] - adopted.anchors[3]) // 4
-    ends = [se2_host.compose(adopted.after[k], se2_host.between(track[k], later)) for k in (3, 4)]
-    np.testing.assert_allclose(adopted.republish(quarter, later), 0.75 * ends[0] + 0.25 * ends[1], atol=1e-9)
+    quarter = moved.anchors[3:4] + (moved.anchors[4] - moved.anchors[3]) // 4
+    ends = [se2_host.compose(moved.after[k], se2_host.between(track[k], later)) for k in (3, 4)]
+    np.testing.assert_allclose(moved.carry(quarter, later), 0.75 * ends[0] + 0.25 * ends[1], atol=1e-9)
     # before the first keyframe: by the first
-    first = adopted.republish(np.array([adopted.anchors[0] - 5]), track[:1])
-    np.testing.assert_allclose(first, adopted.after[:1], atol=1e-9)
-    assert len(placement.poses) == len(adopted.after)
+    first = moved.carry(np.array([moved.anchors[0] - 5]), track[:1])
+    np.testing.assert_allclose(first, moved.after[:1], atol=1e-9)
+    assert len(placement.poses) == len(moved.after)
 
 
 def test_host_compose_and_between_are_those_of_the_device():

@@ -100,20 +100,22 @@ class InspectOptions:
     """Settings in TOML, for the topics and the robot's id."""
 
 
-def call(name: str, words: Sequence[str]) -> None:
+def call(command: str, words: Sequence[str]) -> None:
     """Runs one command with its own arguments.
 
     Raises:
       UwbslamError, OSError: what a user can repair.
       SystemExit: bad usage (status 2), or help was asked for (0); the text is printed.
     """
-    options, run = _COMMANDS[name]
+    options, run = _COMMANDS[command]
     default: Any = None
-    fields = {field.name: field for field in dataclasses.fields(options)}
-    if "settings" in fields:
-        required = [name for name, f in fields.items() if f.default is f.default_factory is dataclasses.MISSING]
-        default = options(**dict.fromkeys(required, tyro.MISSING), settings=_settings_file(words))
-    run(tyro.cli(options, args=list(words), default=default, prog=f"uwbslam {name}", description=options.__doc__))
+    names = {field.name for field in dataclasses.fields(options)}
+    if "settings" in names:
+        required = {name: blank for name, blank in (("logs", ()), ("out", Path())) if name in names}
+        default = options(**required, settings=_settings_file(words))
+        for name in required:  # these have to be given all the same
+            setattr(default, name, tyro.MISSING)
+    run(tyro.cli(options, args=list(words), default=default, prog=f"uwbslam {command}", description=options.__doc__))
 
 
 def _settings_file(words: Sequence[str]) -> Settings:
