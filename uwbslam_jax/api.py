@@ -25,7 +25,7 @@ from uwbslam_jax.result import MapImage, RunStatus
 from uwbslam_jax.session import PEEK_SCANS, Facts, Runner, Saved, Update, fit_beams, saved_state
 from uwbslam_jax.settings import Settings
 from uwbslam_jax.simulation import Simulation
-from uwbslam_jax.tuning import Log, Rollout, Tuned, prepare, tune as tune_logs
+from uwbslam_jax.tuning import Log, Rollout, Tuned, check_request, prepare, tune as tune_logs
 from uwbslam_jax.web import write_report
 
 Paths = str | Path | Sequence[str | Path]
@@ -293,13 +293,13 @@ def evaluate(estimate: Result | str | Path, truth: Truth | str | Path) -> dict[s
     Raises:
       RunError, LogError, UsageError: a file that cannot be used.
     """
-    truth = truth if isinstance(truth, Truth) else load_truth(Path(truth))
     if isinstance(estimate, Result):
-        beacons = {beacon.id: beacon.position for beacon in estimate.beacons}
-        return evaluation.evaluate(estimate.stamps, estimate.poses, beacons, truth)
-    run = read_run(estimate)
-    beacons = dict(zip(run.beacon_ids.tolist(), run.beacons, strict=True))
-    return evaluation.evaluate(run.stamps, run.poses, beacons, truth)
+        found, beacons = estimate, {beacon.id: beacon.position for beacon in estimate.beacons}
+    else:
+        found = read_run(estimate)
+        beacons = dict(zip(found.beacon_ids.tolist(), found.beacons, strict=True))
+    truth = truth if isinstance(truth, Truth) else load_truth(Path(truth))
+    return evaluation.evaluate(found.stamps, found.poses, beacons, truth)
 
 
 def load_truth(path: Path) -> Truth:
@@ -338,6 +338,8 @@ def tune(
       ConfigError: a name is unknown or a setting out of range. LogError: see `run`. RolloutError: start-up decides
         nothing, too few frames follow, or there is no truth to tune for.
     """
+    wanted = settings_file.check(settings or Settings())
+    check_request(tuple(params), wanted)
     one = isinstance(recordings, str | Path | LogReader | Simulation) or _are_messages(recordings)
     logs = []
     for source in cast(Sequence[Source], [recordings] if one else recordings):

@@ -114,7 +114,7 @@ class Known(Objective):
 
 
 def test_a_fit_finds_the_minimum_and_its_curvature():
-    found = fit.fit(Known([0.7, -1.2], [5000.0, 300.0]))
+    found = fit(Known([0.7, -1.2], [5000.0, 300.0]))
     np.testing.assert_allclose(np.log(found.values), [0.7, -1.2], atol=0.01)  # the prior pulls by 0.001
     np.testing.assert_allclose(found.sigma, [5000**-0.5, 300**-0.5], rtol=0.01)
     assert found.told == ("", "")
@@ -123,7 +123,7 @@ def test_a_fit_finds_the_minimum_and_its_curvature():
 
 
 def test_what_is_not_observed_stays_where_it_was():
-    found = fit.fit(Known([0.7, -1.2], [5000.0, 0.01]))
+    found = fit(Known([0.7, -1.2], [5000.0, 0.01]))
     assert found.told == ("", "not observed")
     assert found.values[1] == 1.0
     np.testing.assert_allclose(np.log(found.values[0]), 0.7, atol=0.01)
@@ -131,7 +131,7 @@ def test_what_is_not_observed_stays_where_it_was():
 
 def test_what_is_told_from_one_side_is_a_bound():
     objective = Known([0.7, 0.0], [5000.0, 0.0], floor=-3.0)
-    found = fit.fit(objective)
+    found = fit(objective)
     assert found.told == ("", "at most")
     logs = np.log(found.values)
     least = min(objective.value(np.array([logs[0], at])) for at in np.linspace(-9.0, 0.0, 200))
@@ -141,7 +141,7 @@ def test_what_is_told_from_one_side_is_a_bound():
 
 
 def test_a_jump_nearby_is_told_and_does_not_hold_up_the_others():
-    found = fit.fit(Known([0.7, 0.4], [5000.0, 300.0], jump=0.38))
+    found = fit(Known([0.7, 0.4], [5000.0, 300.0], jump=0.38))
     assert list(found.jumps) == [False, True]
     np.testing.assert_allclose(np.log(found.values[0]), 0.7, atol=0.01)
 
@@ -159,7 +159,7 @@ class Twofold(Known):
 
 
 def test_the_deeper_of_two_valleys_is_found():
-    found = fit.fit(Twofold([0.0], [500.0]))
+    found = fit(Twofold([0.0], [500.0]))
     np.testing.assert_allclose(np.log(found.values), [0.7], atol=0.01)
 
 

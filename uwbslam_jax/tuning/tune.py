@@ -68,6 +68,13 @@ class Tuned:
         return _json(self.calibration, self.noises)
 
 
+def check_request(names: tuple[str, ...], settings: Settings) -> tuple[str, ...]:
+    """Names of the parameters, the preset's defaults where there are none. Raises ConfigError, see `tune`."""
+    if settings.filter.lidar_only:
+        raise ConfigError("filter.lidar_only = true: tuning needs ranges")
+    return parameters.check(names or parameters.DEFAULTS[settings.filter.preset])
+
+
 def tune(
     logs: Sequence[Log], names: tuple[str, ...], settings: Settings, goal: Goal, progress: Callable[[str], object]
 ) -> Tuned:
@@ -79,9 +86,7 @@ def tune(
     Raises:
       ConfigError: an unknown name, or settings without ranges. RolloutError: a recording that tells nothing of them.
     """
-    names = parameters.check(names or parameters.DEFAULTS[settings.filter.preset])
-    if settings.filter.lidar_only:
-        raise ConfigError("filter.lidar_only = true: tuning needs ranges")
+    names = check_request(names, settings)
     if goal == "truth" and (without := [log.name for log in logs if log.truth is None]):
         raise RolloutError(f"{without[0]}: has no ground truth of the robot")
     geometry = [name for name in names if not parameters.is_noise(name)]
