@@ -47,8 +47,9 @@ UNSEEN = {
 
 
 def _marked(name: str) -> object:
-    marks = [pytest.mark.slow] * (name in LONG) + [UNSEEN[name]] * (name in UNSEEN)
-    return pytest.param(name, marks=marks)
+    slow = [pytest.mark.slow] if name in LONG else []
+    unseen = [UNSEEN[name]] if name in UNSEEN else []
+    return pytest.param(name, marks=[*slow, *unseen])
 
 
 @pytest.mark.parametrize("name", [_marked(name) for name in MADE])
