@@ -87,16 +87,7 @@ def _to_run(path: Path) -> list[Block]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "path",
-    [
-        # tuning compiles for minutes, and was not yet seen to its end
-        pytest.param(path, marks=[pytest.mark.xfail(strict=False)] if path.stem == "tuning" else [])
-        for path in PAGES
-        if _to_run(path)
-    ],
-    ids=_name,
-)
+@pytest.mark.parametrize("path", [path for path in PAGES if _to_run(path)], ids=_name)
 def test_runs(path: Path, folder: Path, run: Run) -> None:
     """Blocks run in their order in one folder, each in a process of its own, as they are copied one by one."""
     for block in _to_run(path):

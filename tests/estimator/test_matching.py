@@ -200,7 +200,7 @@ def test_a_problem_that_cannot_be_solved_does_not_raise():
 
 @pytest.mark.usefixtures("x64")
 def test_gradient_of_an_alignment_agrees_with_finite_differences(room_map):
-    """Through all moves of all levels, as many as are made: by prior, start, map and sigma_l (reverse mode only)."""
+    """Through all moves of all levels, as many as are made: by prior, start, map and sigma_l."""
     grid = double(room_map._replace(levels=room_map.levels[:2]))
     sweep = double(sweep_at((0.33, -0.41, 0.6), 60))
     weights = jnp.array([1.0, -2.0, 0.5])
@@ -213,7 +213,7 @@ def test_gradient_of_an_alignment_agrees_with_finite_differences(room_map):
 
     truth = jnp.array([0.33, -0.41, 0.6])
     at = (truth + 0.05, truth + jnp.array([0.06, -0.03, 0.02]), grid.levels[0], jnp.array(SIGMA_L))
-    assert_gradient(value, at, rtol=1e-4, atol=1e-7, step=1e-7, forward=False, count=4)
+    assert_gradient(value, at, rtol=1e-4, atol=1e-7, step=1e-7, count=4)
 
 
 def test_from_nearby_fewer_beams_and_moves_find_the_same_place(room_map):

@@ -195,8 +195,8 @@ TUNABLE = ("sigma_n", "sigma_l", "sigma_w", "sigma_map", "independent_beams", "b
 
 @pytest.mark.usefixtures("x64")
 def test_gradient_of_a_whole_step_agrees_with_finite_differences(room_map):
-    """State and estimate after one step by parameters and by the state's mean and covariance; reverse mode, since the
-    solver's loop has no forward one. Without odometry, then with it."""
+    """State and estimate after one step by parameters and by the state's mean and covariance. Without
+    odometry, then with it."""
     truth = POSE + np.array([0.04, -0.03, 0.02])
     finest = room_map._replace(levels=room_map.levels[:1])
     state = knowing(finest, velocity=(0.3, 0.1), yaw_rate=0.1)

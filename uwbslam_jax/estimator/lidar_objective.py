@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Bool, Float
 
@@ -18,7 +19,7 @@ def lidar_gram(
     pose: Float[Array, "3"],
     level: Float[Array, "c c"],
     origin: Float[Array, "2"],
-    size: float | Float[Array, ""],
+    size: float | Float[Array | np.ndarray, ""],
     points: Float[Array, "B 2"],
     valid: Bool[Array, "B"],
 ) -> Float[Array, "4 4"]:
@@ -43,7 +44,7 @@ def lidar_residual(
     pose: Float[Array, "3"],
     level: Float[Array, "c c"],
     origin: Float[Array, "2"],
-    size: float | Float[Array, ""],
+    size: float | Float[Array | np.ndarray, ""],
     points: Float[Array, "B 2"],
     valid: Bool[Array, "B"],
 ) -> Float[Array, "4"]:

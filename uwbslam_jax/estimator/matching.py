@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import lineax as lx
 import optimistix as optx
+from jax import lax
+from jax.custom_derivatives import SymbolicZero
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
@@ -190,9 +193,53 @@ def gauss_newton(
     residual: Callable[..., Float[Array, "r"]], start: Float[Array, "d"], args: Any, steps: int, still: float = 0.0
 ) -> Float[Array, "d"]:
     """Least squares by so many Gauss-Newton steps at most; never raises, returns the last iterate. A step of which
-    every coordinate is shorter than `still` is the last. residual: of the unknowns (d,) and args."""
-    adjoint, solver = optx.RecursiveCheckpointAdjoint(), _GaussNewton(atol=still)
-    return optx.least_squares(residual, solver, start, args=args, max_steps=steps, throw=False, adjoint=adjoint).value
+    every coordinate is shorter than `still` is the last.
+
+    The derivative is that of the steps taken, one after the other over the iterates, which are kept: a derivative of
+    the loop itself takes minutes to compile, and has no forward mode.
+
+    Args:
+      residual: of the unknowns (d,) and args; closes over no array.
+    """
+    solver = _GaussNewton(atol=still)
+
+    def move(y: Float[Array, "d"], args: Any) -> tuple[Float[Array, "d"], Float[Array, "d"]]:
+        return solver.step(lambda y, args: (residual(y, args), None), y, args)[:2]
+
+    @jax.custom_jvp
+    def solve(start: Float[Array, "d"], args: Any) -> Float[Array, "d"]:
+        return optx.least_squares(residual, solver, start, args=args, max_steps=steps, throw=False).value
+
+    @partial(solve.defjvp, symbolic_zeros=True)
+    def derivative(at: tuple[Any, Any], along: tuple[Any, Any]) -> tuple[Any, Any]:
+        fixed, (start, args) = jax.tree.map(lax.stop_gradient, at), at
+
+        def one(carry: Any) -> Any:
+            k, y, iterates, _ = carry
+            after, step = move(y, fixed[1])
+            return k + 1, after, iterates.at[k].set(y), jnp.max(jnp.abs(step)) < still
+
+        first = 0, fixed[0], jnp.zeros((steps, *start.shape), start.dtype), False
+        count, y, iterates, _ = lax.while_loop(lambda c: (c[0] < steps) & ~c[3], one, first)
+        leaves, tree = jax.tree.flatten(args)
+        dots = jax.tree.leaves(along[1], is_leaf=lambda x: isinstance(x, SymbolicZero))
+        varied = [k for k, dot in enumerate(dots) if not isinstance(dot, SymbolicZero)]
+
+        def of(y: Float[Array, "d"], values: list[Any]) -> Float[Array, "d"]:
+            new = dict(zip(varied, values, strict=True))
+            return move(y, tree.unflatten([new.get(k, leaf) for k, leaf in enumerate(leaves)]))[0]
+
+        def through(y_dot: Float[Array, "d"], step: tuple[Any, Any]) -> tuple[Float[Array, "d"], None]:
+            k, y = step
+            at = y, [leaves[k] for k in varied]
+            moved = jax.jvp(of, at, (y_dot, [dots[k] for k in varied]))[1]
+            return jnp.where(k < count, moved, y_dot), None
+
+        dot = along[0]
+        dot = jnp.zeros_like(start) if isinstance(dot, SymbolicZero) else dot
+        return y, lax.scan(through, dot, (jnp.arange(steps), iterates))[0]
+
+    return solve(start, args)
 
 
 def thinned(sweep: Sweep, most: int = _CHECKED_BEAMS) -> Sweep:
@@ -237,7 +284,7 @@ def align(
             pose = at_level(k, sweep, pose, _STEPS[min(k, 2)], _CONVERGED)
         return pose
 
-    return jax.lax.cond(near, from_nearby, from_afar, start)
+    return lax.cond(near, from_nearby, from_afar, start)
 
 
 def assess(grid: Grid, view: View, pose: Float[Array, "3"], resolution: float) -> Match:
@@ -318,11 +365,11 @@ def search(
         gain = jnp.where(inside, value - 0.5, 0.0).reshape(places.shape[0], -1)
         return jnp.sum(jnp.where(valid, gain, 0.0), axis=1)
 
-    table = jax.lax.map(scores, headings, batch_size=8)  # (headings, places)
+    table = lax.map(scores, headings, batch_size=8)  # (headings, places)
     best_place = jnp.argmax(table, axis=1)
     value = jnp.max(table, axis=1)
     peak = (value >= jnp.roll(value, 1)) & (value >= jnp.roll(value, -1))
-    _, best = jax.lax.top_k(jnp.where(peak, value, -jnp.inf), _SEARCH_REFINED)
+    _, best = lax.top_k(jnp.where(peak, value, -jnp.inf), _SEARCH_REFINED)
     starts = jnp.concatenate([places[best_place[best]], headings[best, None]], axis=1)
     starts = jnp.concatenate([found[None], starts])
     information = jnp.linalg.inv(expected.cov[:2, :2])
@@ -336,6 +383,6 @@ def search(
         unlikely = jnp.min(jnp.sum((away @ information) * away, axis=1)) + jnp.min(turned**2)
         return pose, (m.score - 0.5) * m.known - _UNLIKELY * unlikely
 
-    poses, values = jax.lax.map(refine, starts)
+    poses, values = lax.map(refine, starts)
     pose = poses[jnp.argmax(values)]
     return pose.at[2].set(expected.mean[2] + wrap_angle(pose[2] - expected.mean[2]))

@@ -60,7 +60,10 @@ _WINDOW = lax.GatherDimensionNumbers(offset_dims=(1, 2), collapsed_slice_dims=()
 
 
 def corner_log_odds(
-    level: Float[Array, "c c"], origin: Float[Array, "2"], size: float | Float[Array, ""], points: Float[Array, "n 2"]
+    level: Float[Array, "c c"],
+    origin: Float[Array, "2"],
+    size: float | Float[Array | np.ndarray, ""],
+    points: Float[Array, "n 2"],
 ) -> tuple[Float[Array, "n 2 2"], Float[Array, "n 2"], Bool[Array, "n"]]:
     """The four cells around each point [row, col], the point's place between them in [0, 1], and whether it is inside.
 
@@ -76,7 +79,7 @@ def corner_log_odds(
 
 
 def interpolate(
-    corners: Float[Array, "n 2 2"], at: Float[Array, "n 2"], size: float | Float[Array, ""]
+    corners: Float[Array, "n 2 2"], at: Float[Array, "n 2"], size: float | Float[Array | np.ndarray, ""]
 ) -> tuple[Float[Array, "n"], Float[Array, "n 2"]]:
     """Bilinear value and its gradient [1/m] (paper, "LiDAR map matching"; HectorSLAM eq. 4-6)."""
     fx, fy = at[:, 0], at[:, 1]

@@ -20,7 +20,7 @@ from uwbslam_jax.evaluation import Truth
 from uwbslam_jax.measurements import Frame
 from uwbslam_jax.settings import Config, Params
 from uwbslam_jax.tuning import parameters
-from uwbslam_jax.tuning.rollout import Losses, Rollout, checkpointed, losses, rescaled, whole_chunks
+from uwbslam_jax.tuning.rollout import Losses, Rollout, losses, rescaled
 
 Goal = Literal["likelihood", "truth"]
 HELD_SHARE = 0.25
@@ -65,8 +65,7 @@ def piece(rollout: Rollout, truth: Truth | None = None, held: float = HELD_SHARE
     true = np.full((rollout.count, 2), np.nan)
     if truth is not None:
         true = truth.poses_at(rollout.stamps)[:, :2]
-    count = whole_chunks(jax.tree.map(lambda x: x[: round((1 - held) * rollout.count)], rollout.frames)).dt.shape[0]
-    return Piece(rollout, true, count)
+    return Piece(rollout, true, round((1 - held) * rollout.count))
 
 
 @dataclass
@@ -194,8 +193,10 @@ def _value_and_gradient(
     """Of a rollout from its start, with the truth of its frames."""
     (params, state), (frames, true) = start, data
 
-    def total(logs: Float[Array, "p"]) -> Float[Array, ""]:
+    def total(logs: Float[Array, "p"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
         tuned = parameters.put(params, names, logs)
-        return _total(checkpointed(config, tuned, rescaled(tuned, params, state), frames), true, goal)
+        value = _total(losses(config, tuned, rescaled(tuned, params, state), frames), true, goal)
+        return value, value
 
-    return jax.value_and_grad(total)(logs)
+    gradient, value = jax.jacfwd(total, has_aux=True)(logs)
+    return value, gradient

@@ -8,15 +8,15 @@ derivative and no part in a rollout.
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from uwbslam_jax.errors import RolloutError
@@ -177,15 +177,36 @@ def stacked(frames: Sequence[StampedFrame]) -> Frame:
 
 @partial(jax.jit, static_argnums=0)
 def losses(config: Config, params: Params, state: State, frames: Frame) -> Losses:
-    """Every frame's losses, forward only."""
-    return lax.scan(partial(_step, config, params), rescaled(params, params, state), frames)[1]
+    """Every frame's losses from a state on; differentiable in forward mode.
+
+    What is differentiated is the step with its decisions held: cells that are hit, gates, the choice between search and
+    match. Where a decision changes the function jumps; the derivative is that between two jumps.
+    """
+    return lax.scan(partial(_step, config, params), state, frames)[1]
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+@partial(jax.jit, static_argnums=0)
+def _loss(config: Config, params: Params, before: Params, state: State, frames: Frame) -> Float[Array, ""]:
+    told = losses(config, params, rescaled(params, before, state), frames)
+    return (jnp.sum(told.ranges) + jnp.sum(told.matches)) / (jnp.sum(told.counts) + jnp.sum(frames.has_scan))
 
 
 @partial(jax.jit, static_argnums=0)
-def _loss(config: Config, params: Params, before: Params, state: State, frames: Frame) -> Float[Array, ""]:
-    told = checkpointed(config, params, rescaled(params, before, state), frames)
-    count = jnp.sum(told.counts) + jnp.sum(frames.has_scan[: told.counts.shape[0]])
-    return (jnp.sum(told.ranges) + jnp.sum(told.matches)) / count
+def _loss_and_gradient(config: Config, params: Params, *rest: Any) -> tuple[Float[Array, ""], Params]:
+    """All derivatives at once in forward mode: parameters are few, and the way back over a recording would have to
+    keep or draw again its map at each frame."""
+    flat, unravel = ravel_pytree(params)
+
+    def loss(flat: Float[Array, "p"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        value = _loss.fun(config, unravel(flat), *rest)
+        return value, value
+
+    gradient, value = jax.jacfwd(loss, has_aux=True)(flat)
+    return value, unravel(gradient)
+
+
+_loss.defvjp(_loss_and_gradient, lambda _, gradient, by: (jax.tree.map(lambda g: by * g, gradient), None, None, None))
 
 
 def rescaled(params: Params, before: Params, state: State) -> State:
@@ -201,25 +222,3 @@ def _step(config: Config, params: Params, state: State, frame: Frame) -> tuple[S
     used = jnp.sum(told.weight > 0).astype(jnp.float32)
     assert told.match_log_likelihood is not None  # only the host goes without
     return state, Losses(-told.log_likelihood, -told.match_log_likelihood, used, told.pose)
-
-
-def checkpointed(config: Config, params: Params, state: State, frames: Frame) -> Losses:
-    """The same, for reverse mode: a state is kept every sqrt(T) frames, and each chunk is run again on the way back,
-    its loops of Gauss-Newton moves with checkpoints of their own. T has to be a multiple of its root's whole part.
-
-    What is differentiated is the step with its decisions held: cells that are hit, gates, the choice between search and
-    match. Where a decision changes the function jumps; the derivative is that between two jumps.
-    """
-    inner = math.isqrt(frames.dt.shape[0])
-    # within a chunk what a step has to remember is kept: less than its map, which does not depend on any parameter
-    chunk = jax.checkpoint(lambda s, f: lax.scan(partial(_step, config, params), s, f), prevent_cse=False)
-    nested = jax.tree.map(lambda x: x.reshape(-1, inner, *x.shape[1:]), whole_chunks(frames))
-    _, told = lax.scan(chunk, state, nested)
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), told)
-
-
-def whole_chunks(frames: Frame) -> Frame:
-    """The frames that fill chunks of sqrt(T): at most as many fewer."""
-    count = frames.dt.shape[0]
-    inner = math.isqrt(count)
-    return jax.tree.map(lambda x: x[: count // inner * inner], frames)
