@@ -153,7 +153,7 @@ class Hokuyo:
     """Handshake: QT, SCIP2.0, VV, PP, II, TM for the clock, then MD or ME without end."""
 
     kind = "lidar"
-    baud = 115200
+    bauds = (115200,)
     dtr = True
     tcp_port = 10940
     silence = 2.0
@@ -204,12 +204,19 @@ def _fields(lines: list[bytes]) -> dict[str, str]:
 
 def _specification(port: Port) -> Specification:
     fields: dict[str, str] = {}
+    heard = False
     for _ in range(_ATTEMPTS):
-        fields |= _fields(_ask(port, b"PP", attempts=1) or [])
+        answer = _ask(port, b"PP", attempts=1)
+        heard = heard or answer is not None
+        fields |= _fields(answer or [])
         spec = parse_specification(fields)
         if spec is not None:
             return spec
-    raise DeviceFailure("no answer to PP: not a SCIP 2 sensor, or it does not hear us")
+    if heard and not fields:
+        raise DeviceFailure("the sensor refuses PP: it speaks SCIP 1 only, update its firmware (URG-04LX: 3.3.00)")
+    if heard:
+        raise DeviceFailure(f"the answer to PP is damaged or incomplete, it has only {', '.join(fields)}")
+    raise DeviceFailure("no answer to PP: not a SCIP 2 sensor, no power, or another program or speed at its port")
 
 
 def _malfunction(lines: list[bytes]) -> str | None:

@@ -88,7 +88,7 @@ def _ranges(frame: bytes) -> list[Measured]:
 class LinkTrack(SerialRadio):
     """Sends by itself what it was set up for (NodeFrame2 or NodeFrame3 in NAssistant)."""
 
-    baud = 921600
+    bauds = (921600,)
 
     def start(self, port: Port, options: Mapping[str, str], dropped: Counter[str]) -> Session:
         return Session(LinkTrackDecoder(dropped), b"", WRAP)
