@@ -19,6 +19,7 @@ from uwbslam_drivers import scip
 from uwbslam_drivers.clock import host_time
 from uwbslam_drivers.device import DeviceFailure, Measured, Option, Port, Session, read_until
 from uwbslam_jax.measurements import NAN, ScanMessage
+from uwbslam_jax.reasons import ScanLost
 
 MS, WRAP = 1_000_000, (1 << 24) * 1_000_000
 """A millisecond, and the period of the sensor's clock, which counts them in 24 bits [ns] (SCIP 2.0, MD)."""
@@ -130,7 +131,7 @@ class HokuyoDecoder:
     def _scan(self, stamp: bytes, body: bytes) -> Measured | None:
         spec = self._spec
         if not scip.intact(stamp):
-            self._dropped["scan: stamp damaged"] += 1
+            self._dropped[ScanLost.STAMP_DAMAGED] += 1
             return None
         values, good, damaged = scip.decode_blocks(body, self._values)
         if damaged:
@@ -138,7 +139,7 @@ class HokuyoDecoder:
         step = self._values // spec.beams
         values, good = values[::step], good[::step]
         if np.mean(good) < LEAST_INTACT:
-            self._dropped["scan: too little of it intact"] += 1
+            self._dropped[ScanLost.NOT_INTACT] += 1
             return None
         hit = values >= max(spec.nearest, 1)
         ranges = np.where(good, np.where(hit, values * np.float32(1e-3), np.inf), NAN).astype(np.float32)

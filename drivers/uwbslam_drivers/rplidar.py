@@ -17,6 +17,7 @@ import numpy as np
 
 from uwbslam_drivers.device import DeviceFailure, Measured, NoAnswer, Option, Port, Session, read_until
 from uwbslam_jax.measurements import ScanMessage
+from uwbslam_jax.reasons import ScanLost
 
 STOP, RESET, SCAN, GET_HEALTH, GET_SAMPLERATE = b"\xa5\x25", b"\xa5\x40", b"\xa5\x20", b"\xa5\x52", b"\xa5\x59"
 """Requests without payload: A5 and a command [bytes] (LR001)."""
@@ -78,7 +79,7 @@ class Sweep:
                 found = self._close()
             self._samples, self._whole = [], True
         if len(self._samples) >= SWEEP:
-            self._dropped["scan: no new turn"] += 1
+            self._dropped[ScanLost.NO_TURN] += 1
             self._samples, self._whole = [], False
         self._samples.append(sample)
         return found
@@ -95,12 +96,12 @@ class Sweep:
         order = np.argsort(angle, kind="stable")
         angle, distance = angle[order], distance[order]
         if angle.size < LEAST_SAMPLES or angle[-1] - angle[0] < 180.0:
-            self._dropped["scan: too few samples"] += 1
+            self._dropped[ScanLost.FEW_SAMPLES] += 1
             return []
         step = float(np.median(np.diff(angle)))
         index = np.round((angle - angle[0]) / step) if step > 0.0 else np.arange(float(angle.size))
         if index[-1] >= SWEEP:
-            self._dropped["scan: angles do not fit"] += 1
+            self._dropped[ScanLost.ANGLES] += 1
             return []
         # The motor's speed hardly changes within a turn: one straight line through all angles.
         slope, first = np.polyfit(index, angle, 1)
