@@ -17,19 +17,19 @@ _PLURAL = {Sensor.SCAN: "scans", Sensor.RANGE: "ranges", Sensor.ODOMETRY: "odome
 """Several measurements of a sensor [sensor -> words]."""
 
 
-def losses(used: Mapping[Sensor, int], dropped: Mapping[str, int], few: int = FEW) -> dict[Sensor, str]:
+def losses(used: Mapping[Sensor, int], dropped: Mapping[str, int], least: int = 1) -> dict[Sensor, str]:
     """A line for each sensor of which more than a fifth was lost: how much, why, and what helps.
 
     Args:
       used: measurements that went into frames.
       dropped: measurements left out, by reason; what is no `Reason` is of no sensor.
-      few: see FEW.
+      least: fewer that are lost are not told, even where they are all.
     """
     told = {}
     for sensor in Sensor:
         own = {why: n for why, n in dropped.items() if isinstance(why, Reason) and why.sensor is sensor and n > 0}
         lost, kept = sum(own.values()), used.get(sensor, 0)
-        if lost > MANY * (lost + kept) and (lost >= few or not kept):
+        if lost > MANY * (lost + kept) and lost >= (max(FEW, least) if kept else least):
             often = sorted(own, key=lambda why: -own[why])
             share = f"{lost} of {lost + kept}" if kept else f"all {lost}"
             named = ", ".join(f"{own[why]} x {why.words}" for why in often[:_MOST_REASONS])

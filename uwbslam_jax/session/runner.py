@@ -117,10 +117,10 @@ class Runner:
         )
         return to_result(self.session, told)
 
-    def warnings(self, dropped: Counter[str], few: int) -> dict[Sensor | str, str]:
-        """What a user should know by now, one line each, by what it is about. dropped, few: see losses."""
+    def warnings(self, dropped: Counter[str], least: int = 1) -> dict[Sensor | str, str]:
+        """What a user should know by now, one line each, by what it is about. dropped, least: see losses."""
         told: dict[Sensor | str, str] = {text: text for text in self._assembler.warnings}
-        return told | losses(self._assembler.used, dropped + self._assembler.dropped, few)
+        return told | losses(self._assembler.used, dropped + self._assembler.dropped, least)
 
     def relative(self) -> Relative | None:
         """Geometry of the nodes among themselves while the robot rests; None where the ranges do not fix one, or show
