@@ -29,8 +29,9 @@ _REPLIES = {
 _DENSE = b"\xa5\x5a\x54\x00\x00\x40\x85"
 """Descriptor of dense capsules [bytes] (Slamtec's SDK)."""
 _REPLIES_C1 = _REPLIES | {protocol.EXPRESS: _DENSE}
+"""The same of a C1 [bytes]."""
 _REPLIES_OLD = {request: _REPLIES[request] for request in (protocol.GET_HEALTH, protocol.SCAN)}
-"""The same of a C1, and of an A1 with old firmware [bytes]."""
+"""The same of an A1 with old firmware [bytes]."""
 
 
 class Samples(NamedTuple):
