@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from uwbslam_jax.measurements import RangeMessage
+from uwbslam_jax.measurements import RangeMessage, ScanMessage
 from uwbslam_jax.reasons import OdometryLost, RangeLost, ScanLost, Sensor
 from uwbslam_jax.result import RunStatus
 from uwbslam_jax.session.frame_assembler import FrameAssembler
-from uwbslam_jax.session.losses import losses, unplaced
+from uwbslam_jax.session.losses import blank_scans, losses, unplaced
 from uwbslam_jax.session.result_builder import Facts, to_result
 from uwbslam_jax.session.session import Session
 from uwbslam_jax.settings import LidarSettings, MapSettings, Settings
@@ -65,6 +65,15 @@ def test_more_than_a_fifth_is_told(used: dict[Sensor, int], dropped: dict[str, i
     told = losses(used, dropped)
     assert len(told) == (says is not None)
     assert says is None or says in next(iter(told.values()))
+
+
+def test_scans_without_a_return_are_told_where_they_are_most() -> None:
+    frames = FrameAssembler(SMALL, max_ranges=2)
+    for k, reading in enumerate([2.0, np.inf, np.inf]):
+        frames.add(ScanMessage(1 + k, 0.0, 0.1, 0.0, 0.1, 30.0, np.full(20, reading, np.float32)))
+    assert (frames.used[Sensor.SCAN], frames.blank) == (3, 2)
+    assert blank_scans(3, 2)[0].startswith("2 of 3 scans hold no return")
+    assert not blank_scans(0, 0) + blank_scans(4, 2)
 
 
 def test_what_is_not_placed_has_its_own_cause() -> None:

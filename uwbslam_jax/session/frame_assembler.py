@@ -51,7 +51,7 @@ class FrameAssembler:
 
     Attributes:
       slots: node id -> slot, the robot 0; filled as ids are heard.
-      dropped: what was not used, by reason. used: what was, by sensor.
+      dropped: what was not used, by reason. used: what was, by sensor. blank: scans of these without a return.
       warnings: one line each; that there are more beacons than slots is told once.
       odometry_used: whether any frame carried an increment.
     """
@@ -60,6 +60,7 @@ class FrameAssembler:
         self.slots: dict[int, int] = {settings.robot.id: 0}
         self.dropped: Counter[str] = Counter()
         self.used: Counter[Sensor] = Counter()
+        self.blank = 0
         self.warnings: list[str] = []
         self.odometry_used = False
         self._settings = settings
@@ -215,6 +216,7 @@ class FrameAssembler:
             ranges=pad_ranges(ranges, self.slots, stamp, self._max_ranges),
             odometry=odometry,
         )
+        self.blank += scan is not None and not frame.scan.valid.any()
         self._last = stamp
         return StampedFrame(stamp, frame, dict(self.slots))
 

@@ -37,6 +37,14 @@ def losses(used: Mapping[Sensor, int], dropped: Mapping[str, int], least: int = 
     return told
 
 
+def blank_scans(scans: int, blank: int) -> list[str]:
+    """A line where most of the scans that were used held no return."""
+    if 2 * blank <= scans:
+        return []
+    helps = "is the LiDAR covered, or are its readings in another unit? see --lidar.min-range and --lidar.max-range"
+    return [f"{blank} of {scans} scans hold no return within the limits: {helps}"]
+
+
 def unplaced(status: RunStatus, robot: int, *, ranges: int, seen: bool) -> str:
     """The line of a run that heard beacons, or should have, and placed none.
 

@@ -15,7 +15,7 @@ from uwbslam_jax.numerics import turned
 from uwbslam_jax.reasons import Sensor
 from uwbslam_jax.result import BeaconEstimate, BeaconStatus, Result, RunStatus
 from uwbslam_jax.session.history import History
-from uwbslam_jax.session.losses import losses, unplaced
+from uwbslam_jax.session.losses import blank_scans, losses, unplaced
 from uwbslam_jax.session.session import Session
 from uwbslam_jax.session.update import scan_points
 from uwbslam_jax.startup import Relative
@@ -35,6 +35,7 @@ class Facts:
     Attributes:
       warnings: one line each.
       used, dropped: measurements that went into frames, by sensor, and that were left out, by reason.
+      blank: scans that were used and held no return.
       truncated: where the recording breaks, None where it does not.
       odometry_used: whether any frame carried an increment.
       wall_s, compile_s: time taken, and how much of it JAX compiled [s].
@@ -45,6 +46,7 @@ class Facts:
     warnings: list[str] = field(default_factory=list)
     used: Counter[Sensor] = field(default_factory=Counter)
     dropped: Counter[str] = field(default_factory=Counter)
+    blank: int = 0
     truncated: str | None = None
     odometry_used: bool = False
     wall_s: float = 0.0
@@ -64,7 +66,7 @@ def to_result(session: Session, facts: Facts) -> Result:
     kept = history.has_scan.values if scans or not facts.odometry_used else np.ones(len(history.stamps), bool)
     at = slice(None) if kept.all() else np.flatnonzero(kept)  # nothing is copied where it is all of them
     beacons = _beacons(session, session.ids) if facts.relative is None else _relative_beacons(session, facts.relative)
-    told = list(losses(facts.used, facts.dropped).values())
+    told = [*losses(facts.used, facts.dropped).values(), *blank_scans(facts.used[Sensor.SCAN], facts.blank)]
     told += [] if scans else [_NO_SCAN if facts.odometry_used else _NO_TRACK]
     told += [] if facts.relative is None else [_RELATIVE]
     told += [] if beacons else _unplaced(session, facts)

@@ -110,6 +110,7 @@ class Runner:
             facts,
             warnings=warnings,
             used=self._assembler.used,
+            blank=self._assembler.blank,
             dropped=dropped,
             odometry_used=self._assembler.odometry_used,
             step_ms=self._step_ms,
