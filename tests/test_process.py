@@ -47,6 +47,30 @@ def test_what_the_user_has_set_stays() -> None:
     assert json.loads(answer(VARIABLES, **own)) == own
 
 
+WITHOUT_POSIX = """
+import sys
+POSIX = {"resource", "pty", "tty", "termios", "fcntl", "pwd", "grp"}
+
+class Windows:
+    def find_spec(self, name, path=None, target=None):
+        if name in POSIX:
+            raise ImportError(f"there is no {name} here")
+
+for name in POSIX:
+    sys.modules.pop(name, None)
+sys.meta_path.insert(0, Windows())
+import uwbslam_jax, uwbslam_drivers
+from uwbslam_jax import process
+from uwbslam_jax.cli import commands
+print(process.peak_mb())
+"""
+"""Imports all that a command needs where the modules of POSIX systems are missing."""
+
+
+def test_recordings_need_no_module_that_only_posix_systems_have() -> None:
+    assert answer(WITHOUT_POSIX) == "None\n"
+
+
 BLAS = """
 from threadpoolctl import threadpool_info
 print([pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"])

@@ -13,7 +13,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGE, DRIVERS = ROOT / "uwbslam_jax", ROOT / "drivers" / "uwbslam_drivers"
 WINGS = [
-    "measurements result errors process",
+    "measurements result errors process reasons",
     "settings",
     "numerics",
     "mapping evaluation",
@@ -32,7 +32,7 @@ WINGS = [
 ROW = {wing: row for row, wings in enumerate(WINGS) for wing in wings.split()}
 FOR_ANYBODY = {"__version__"}
 """What the package itself gives to its wings."""
-FOR_DRIVERS = {"measurements", "errors"}
+FOR_DRIVERS = {"measurements", "errors", "reasons"}
 """What the drivers may take of the package."""
 FOR_EMULATORS = FOR_DRIVERS | {"numerics", "sim"}
 """What the emulators may take of it, for they simulate."""

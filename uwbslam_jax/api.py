@@ -163,7 +163,8 @@ def run(
     facts.wall_s = time.perf_counter() - begin
     found = finished(runner, facts)
     if reader is not None and not len(found.stamps) and not found.beacons:
-        why = f"; {reader.truncated}" if reader.truncated else ""
+        told = [*runner.warnings(reader.dropped).values(), *([reader.truncated] if reader.truncated else [])]
+        why = "".join(f"; {text}" for text in told)
         raise LogError(
             f"{reader.name}: no usable scan on {settings.lidar.topic}, no odometry on {settings.odom.topic}, and no "
             f"ranges that fix a geometry on {settings.uwb.topic}{why}"

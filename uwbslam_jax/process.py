@@ -71,6 +71,16 @@ def few_arenas() -> None:
         mallopt(_ARENA_MAX, _ARENAS)
 
 
+def peak_mb() -> float | None:
+    """The most memory that this process has held [MB], None where the system does not tell (Windows)."""
+    try:
+        import resource
+    except ImportError:
+        return None
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return most / (1 << 20 if sys.platform == "darwin" else 1 << 10)  # bytes there, kB on Linux
+
+
 def give_back() -> None:
     """Hands memory that is free to the system: what threads allocate by turns is kept in ever more pieces otherwise."""
     if sys.platform == "linux" and (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:

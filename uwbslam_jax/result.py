@@ -16,10 +16,14 @@ _OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205
 
 
 class RunStatus(StrEnum):
-    """How far start-up is; the value is what files and pages say."""
+    """How far start-up is; the value is what files and pages say.
+
+    UNSEEN: a run ended waiting for motion that no scan and no odometry could have shown.
+    """
 
     LIDAR_ONLY = "LiDAR only"
     WAITING = "waiting for motion"
+    UNSEEN = "motion not known"
     PLACING = "placing beacons"
     UNDECIDED = "reflection undecided"
     DECIDED = "decided"

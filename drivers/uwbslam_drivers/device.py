@@ -26,6 +26,10 @@ class DeviceFailure(OSError):
     """A device that does not answer as its protocol says; the port is closed and opened anew."""
 
 
+class NoAnswer(DeviceFailure):
+    """Nothing that is understood comes at all: the port may have another speed."""
+
+
 class Measured(NamedTuple):
     """One decoded measurement.
 
@@ -76,6 +80,7 @@ class Session:
       wrap: period after which the device's clock starts again [ns]; None where it does not or there is none.
       least_delay: the shortest time from a measurement to its arrival [ns], as far as the protocol says.
       reference: time on the device's clock and host time of one moment [ns, ns], from an exchange for that purpose.
+      notes: what a user should know of how it talks, one line each.
     """
 
     decoder: Decoder
@@ -83,6 +88,7 @@ class Session:
     wrap: int | None = None
     least_delay: int = 0
     reference: tuple[int, int] | None = None
+    notes: tuple[str, ...] = ()
 
 
 class Device(Protocol):
@@ -90,7 +96,7 @@ class Device(Protocol):
 
     Attributes:
       kind: "lidar" or "uwb".
-      baud: default speed of its serial port.
+      bauds: speeds of its serial port, the usual one first; where a URL gives none they are tried in turn.
       dtr: what its serial port's DTR line is set to; it switches the motor of some scanners, and resets some boards.
       tcp_port: where it listens by default; None where it has no network port of its own.
       silence: without a byte for so long, the port is closed and opened anew [s].
@@ -100,7 +106,7 @@ class Device(Protocol):
     @property
     def kind(self) -> str: ...
     @property
-    def baud(self) -> int: ...
+    def bauds(self) -> tuple[int, ...]: ...
     @property
     def dtr(self) -> bool: ...
     @property
@@ -127,7 +133,7 @@ class SerialRadio:
     """What UWB radios at a serial port have in common, see `Device`."""
 
     kind = "uwb"
-    baud = 115200
+    bauds: tuple[int, ...] = (115200,)
     dtr = True
     tcp_port: int | None = None
     silence = 5.0

@@ -18,6 +18,9 @@ from uwbslam_jax.measurements import RangeMessage
 _LISTEN, _ANSWER = 0.6, 1.5
 """Longest wait for a line of a module that sends several a second already, and for the shell's banner [s]."""
 
+_TLV = b"\x40\x01"
+"""What a module in generic mode answers to a request that it does not know [bytes] (firmware API guide, 5.2)."""
+
 
 class Dwm1001Decoder(LineDecoder):
     """Lines to ranges from the module that is connected; stamped with their arrival."""
@@ -70,7 +73,12 @@ class Dwm1001(SerialRadio):
         time.sleep(0.1)
         port.write(b"\r")
         if not _hears(port, b"dwm>", _ANSWER) and not _hears(port, b"DIST", _LISTEN):
-            raise DeviceFailure("no shell: not a DWM1001 in UART shell mode")
+            port.write(b"\r")
+            if _hears(port, _TLV, _LISTEN):
+                raise DeviceFailure(
+                    "the module stays in generic (TLV) mode: its firmware (PANS R2) must offer the shell"
+                )
+            raise DeviceFailure("no shell: not a DWM1001 in UART shell mode, no power, or another baud than 115200")
         port.write(b"lec\r")
         return session
 

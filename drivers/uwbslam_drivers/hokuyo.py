@@ -19,6 +19,7 @@ from uwbslam_drivers import scip
 from uwbslam_drivers.clock import host_time
 from uwbslam_drivers.device import DeviceFailure, Measured, Option, Port, Session, read_until
 from uwbslam_jax.measurements import NAN, ScanMessage
+from uwbslam_jax.reasons import ScanLost
 
 MS, WRAP = 1_000_000, (1 << 24) * 1_000_000
 """A millisecond, and the period of the sensor's clock, which counts them in 24 bits [ns] (SCIP 2.0, MD)."""
@@ -130,7 +131,7 @@ class HokuyoDecoder:
     def _scan(self, stamp: bytes, body: bytes) -> Measured | None:
         spec = self._spec
         if not scip.intact(stamp):
-            self._dropped["scan: stamp damaged"] += 1
+            self._dropped[ScanLost.STAMP_DAMAGED] += 1
             return None
         values, good, damaged = scip.decode_blocks(body, self._values)
         if damaged:
@@ -138,7 +139,7 @@ class HokuyoDecoder:
         step = self._values // spec.beams
         values, good = values[::step], good[::step]
         if np.mean(good) < LEAST_INTACT:
-            self._dropped["scan: too little of it intact"] += 1
+            self._dropped[ScanLost.NOT_INTACT] += 1
             return None
         hit = values >= max(spec.nearest, 1)
         ranges = np.where(good, np.where(hit, values * np.float32(1e-3), np.inf), NAN).astype(np.float32)
@@ -153,7 +154,7 @@ class Hokuyo:
     """Handshake: QT, SCIP2.0, VV, PP, II, TM for the clock, then MD or ME without end."""
 
     kind = "lidar"
-    baud = 115200
+    bauds = (115200,)
     dtr = True
     tcp_port = 10940
     silence = 2.0
@@ -204,12 +205,19 @@ def _fields(lines: list[bytes]) -> dict[str, str]:
 
 def _specification(port: Port) -> Specification:
     fields: dict[str, str] = {}
+    heard = False
     for _ in range(_ATTEMPTS):
-        fields |= _fields(_ask(port, b"PP", attempts=1) or [])
+        answer = _ask(port, b"PP", attempts=1)
+        heard = heard or answer is not None
+        fields |= _fields(answer or [])
         spec = parse_specification(fields)
         if spec is not None:
             return spec
-    raise DeviceFailure("no answer to PP: not a SCIP 2 sensor, or it does not hear us")
+    if heard and not fields:
+        raise DeviceFailure("the sensor refuses PP: it speaks SCIP 1 only, update its firmware (URG-04LX: 3.3.00)")
+    if heard:
+        raise DeviceFailure(f"the answer to PP is damaged or incomplete, it has only {', '.join(fields)}")
+    raise DeviceFailure("no answer to PP: not a SCIP 2 sensor, no power, or another program or speed at its port")
 
 
 def _malfunction(lines: list[bytes]) -> str | None:

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 
 from uwbslam_drivers.device import Measured
+from uwbslam_jax.reasons import RangeLost
 
 LONGEST = 1024
 """A longer line is noise [bytes]: 32 ranges of a Makerfabs tag, the most a radio reports in one, take about 600."""
@@ -25,7 +26,7 @@ class Lines:
         found = []
         for line in done:
             if self._overlong or len(line) > LONGEST:
-                self._dropped["line: too long"] += 1
+                self._dropped[RangeLost.LINE_TOO_LONG] += 1
                 self._overlong = False
             elif line:
                 found.append(line)
@@ -57,7 +58,7 @@ class LineDecoder(ABC):
             if ranges is not None:
                 found += ranges
             elif self.sign in line:
-                self._dropped["line: damaged"] += 1
+                self._dropped[RangeLost.LINE_DAMAGED] += 1
         return found
 
     @abstractmethod

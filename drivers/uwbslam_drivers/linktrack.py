@@ -12,6 +12,7 @@ from collections.abc import Mapping
 
 from uwbslam_drivers.device import Measured, Port, SerialRadio, Session
 from uwbslam_jax.measurements import RangeMessage
+from uwbslam_jax.reasons import RangeLost
 
 MS, WRAP = 1_000_000, (1 << 32) * 1_000_000
 """A millisecond, and the period of the system time, which counts them in 32 bits [ns]."""
@@ -41,7 +42,7 @@ class LinkTrackDecoder:
             elif len(buffer) - at < length:
                 break
             elif sum(buffer[at : at + length - 1]) & 0xFF != buffer[at + length - 1]:
-                self._dropped["frame: wrong sum"] += 1
+                self._dropped[RangeLost.WRONG_SUM] += 1
                 at += 1
             else:
                 found += _ranges(buffer[at : at + length])
@@ -88,7 +89,7 @@ def _ranges(frame: bytes) -> list[Measured]:
 class LinkTrack(SerialRadio):
     """Sends by itself what it was set up for (NodeFrame2 or NodeFrame3 in NAssistant)."""
 
-    baud = 921600
+    bauds = (921600,)
 
     def start(self, port: Port, options: Mapping[str, str], dropped: Counter[str]) -> Session:
         return Session(LinkTrackDecoder(dropped), b"", WRAP)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import select
 import socket
 
-import serial
-
 CONNECT_TIMEOUT = 2.0
 """Time for a TCP connection to come about [s]: TCP repeats a lost first packet after 1 s."""
 WRITE_TIMEOUT = 1.0
@@ -42,10 +40,15 @@ class SerialPort:
     """A serial line, held exclusively: a second program on the same port would take half of the bytes each."""
 
     def __init__(self, path: str, baud: int, dtr: bool = True):
+        import serial  # here, for it needs the terminals of a POSIX system, and recordings are run without
+
         self._serial = serial.Serial(None, baud, timeout=0, write_timeout=WRITE_TIMEOUT, exclusive=True)
         self._serial.dtr = dtr  # before it is opened, or a motor stops and a board resets for a moment
         self._serial.port = path
-        self._serial.open()
+        try:
+            self._serial.open()
+        except ValueError as error:  # a speed that this computer's port does not have
+            raise OSError(f"{path}: {error}") from None
 
     def read(self, timeout: float) -> bytes:
         # pyserial sets up the port anew for each new timeout, so the waiting is done here.

@@ -8,14 +8,16 @@ that the samples behind it took.
 from __future__ import annotations
 
 import math
+import re
 import time
-from collections import Counter
-from collections.abc import Callable, Mapping
+from collections import Counter, deque
+from collections.abc import Mapping
 
 import numpy as np
 
-from uwbslam_drivers.device import DeviceFailure, Measured, Option, Port, Session, read_until
+from uwbslam_drivers.device import DeviceFailure, Measured, NoAnswer, Option, Port, Session, read_until
 from uwbslam_jax.measurements import ScanMessage
+from uwbslam_jax.reasons import ScanLost
 
 STOP, RESET, SCAN, GET_HEALTH, GET_SAMPLERATE = b"\xa5\x25", b"\xa5\x40", b"\xa5\x20", b"\xa5\x52", b"\xa5\x59"
 """Requests without payload: A5 and a command [bytes] (LR001)."""
@@ -34,10 +36,22 @@ SWEEP = 8192
 """More samples than in any turn; without a new turn in so many the sweep is dropped [samples]."""
 LEAST_SAMPLES = 30
 """A turn of fewer is dropped: no model has under 200, and a line through the angles needs many [samples]."""
+LEGACY = 476e-6
+"""Time of a sample of firmware that does not tell it [s], which Slamtec's SDK assumes before 1.17."""
+_PERIODS = 20e-6, 2e-3
+"""Times of a sample that a turn may have [s]: 32000 samples a second, and a quarter of the least that is sold."""
+_TURNS = 9
+"""So many turns tell the time of a sample where the scanner does not [turns]: one alone errs by how late it is read."""
+_CAPSULES = {0x83: "HQ nodes", 0x84: "ultra capsules", 0x85: "dense capsules", 0x86: "ultra-dense capsules"}
+"""Data types of scans that are not read [number -> words] (Slamtec's SDK, sl_lidar_cmd.h)."""
+_BEGIN = re.compile(rb"\xa5\x5a..\x00\x40([\x81-\x8f])", re.DOTALL)
+"""A descriptor of any scan, with its data type [bytes]: many answers to one request (LR001)."""
 _LOCK = 6
 """So many nodes in a row must look right before they are taken for nodes: each alone has 2 check bits [samples]."""
-_ANSWER = 0.5
-"""An answer is waited for so long before the request is repeated [s]: bytes are lost on serial lines."""
+_ATTEMPTS, _ANSWER = 5, 0.5
+"""How often a request is sent at most, and how long its answer is waited for [s]: bytes are lost on serial lines."""
+_SPEEDS = {115200: "A1, A2", 256000: "A2M7, A2M12, A3, S1", 460800: "C1", 1000000: "S2, S3"}
+"""Speeds of the serial port [baud -> models]."""
 
 Sample = tuple[float, float, int]
 """Clockwise angle [deg, 0 to 360], distance [m], host time [ns]."""
@@ -46,9 +60,10 @@ Sample = tuple[float, float, int]
 class Sweep:
     """Samples to scans: a scan is complete when the angle begins anew."""
 
-    def __init__(self, period: float, dropped: Counter[str]):
-        """period: time between two samples [s]."""
-        self._period = period
+    def __init__(self, period: float | None, dropped: Counter[str]):
+        """period: time between two samples [s], None where the scanner does not tell: the turns then do."""
+        self.period = LEGACY if period is None else period
+        self._turns: deque[float] | None = deque(maxlen=_TURNS) if period is None else None
         self._dropped = dropped
         self._samples: list[Sample] = []
         self._whole = False  # the first turn is seen from somewhere on
@@ -60,25 +75,33 @@ class Sweep:
             return found  # a straggler of the turn before: offsets within a capsule may swap neighbours
         if self._samples and sample[0] < self._samples[-1][0] - 180.0:
             if self._whole:
+                self._time(sample[2])
                 found = self._close()
             self._samples, self._whole = [], True
         if len(self._samples) >= SWEEP:
-            self._dropped["scan: no new turn"] += 1
+            self._dropped[ScanLost.NO_TURN] += 1
             self._samples, self._whole = [], False
         self._samples.append(sample)
         return found
+
+    def _time(self, end: int) -> None:
+        """Finds the time of a sample from a turn that ends at a host time [ns], where it was not told."""
+        period = (end - self._samples[0][2]) / 1e9 / len(self._samples)
+        if self._turns is not None and _PERIODS[0] < period < _PERIODS[1]:
+            self._turns.append(period)
+            self.period = float(np.median(self._turns))
 
     def _close(self) -> list[Measured]:
         angle, distance = np.array([s[:2] for s in self._samples]).T
         order = np.argsort(angle, kind="stable")
         angle, distance = angle[order], distance[order]
         if angle.size < LEAST_SAMPLES or angle[-1] - angle[0] < 180.0:
-            self._dropped["scan: too few samples"] += 1
+            self._dropped[ScanLost.FEW_SAMPLES] += 1
             return []
         step = float(np.median(np.diff(angle)))
         index = np.round((angle - angle[0]) / step) if step > 0.0 else np.arange(float(angle.size))
         if index[-1] >= SWEEP:
-            self._dropped["scan: angles do not fit"] += 1
+            self._dropped[ScanLost.ANGLES] += 1
             return []
         # The motor's speed hardly changes within a turn: one straight line through all angles.
         slope, first = np.polyfit(index, angle, 1)
@@ -88,15 +111,15 @@ class Sweep:
         ranges[slots[slots < SWEEP]] = np.where(distance > 0.0, distance, np.inf)[slots < SWEEP]
         begin = self._samples[0][2]
         angles = (-math.radians(first), -math.radians(slope))
-        return [Measured(ScanMessage(begin, *angles, self._period, RANGE_MIN, RANGE_MAX, ranges), None)]
+        return [Measured(ScanMessage(begin, *angles, self.period, RANGE_MIN, RANGE_MAX, ranges), None)]
 
 
 class StandardDecoder:
     """Nodes of 5 bytes: quality and start flag, angle [1/64 deg], distance [1/4 mm]."""
 
-    def __init__(self, period: float, dropped: Counter[str]):
+    def __init__(self, period: float | None, dropped: Counter[str]):
+        """period: see `Sweep`."""
         self._sweep = Sweep(period, dropped)
-        self._period = period
         self._dropped = dropped
         self._buffer = b""
         self._locked = False
@@ -110,7 +133,7 @@ class StandardDecoder:
             node = _node(buffer, at)
             if self._locked and node is not None and _ahead(self._angle, node[0]):
                 self._angle = node[0]
-                behind = (len(buffer) - at - NODE) / NODE * self._period
+                behind = (len(buffer) - at - NODE) / NODE * self._sweep.period
                 found += self._sweep.add((*node, received - round(behind * 1e9)))
                 at += NODE
             elif not self._locked and _nodes(buffer, at):
@@ -219,49 +242,88 @@ def xor(data: bytes) -> int:
 
 
 class Rplidar:
-    """Stops the scanner, asks for its health and sample times, starts the motor and the scan."""
+    """Stops the scanner, asks for its health and sample times, starts the motor and the scan.
+
+    A scanner that has no express scan which is read (C1, S2, S3, firmware before 1.17) scans as by `mode=standard`.
+    """
 
     kind = "lidar"
-    baud = 115200
+    bauds = tuple(_SPEEDS)
     dtr = False  # set, it stops the motor of an A1
     tcp_port = 20108
     silence = 4.0  # the motor takes a while
     options: Mapping[str, Option] = {"mode": Option("express", "standard|express", "standard or express")}
 
     def start(self, port: Port, options: Mapping[str, str], dropped: Counter[str]) -> Session:
-        mode = options["mode"]
         port.write(STOP)
         _drain(port, 0.1)
-        health, _ = _answer(port, GET_HEALTH, HEALTH_HEADER, 3)
+        health = _answer(port, GET_HEALTH, HEALTH_HEADER, 3)
         if health[0] == 2:
             port.write(RESET)
-            raise DeviceFailure(f"the scanner reports error {health[1] | health[2] << 8} and is reset")
-        rates, _ = _answer(port, GET_SAMPLERATE, RATE_HEADER, 4)
+            code = health[1] | health[2] << 8
+            raise DeviceFailure(f"the scanner reports error {code} and is reset; if it stays, its power or motor fails")
+        try:
+            rates = _answer(port, GET_SAMPLERATE, RATE_HEADER, 4)
+        except DeviceFailure:
+            rates = bytes(4)
+        standard, express = (int.from_bytes(rates[k : k + 2], "little") / 1e6 for k in (0, 2))
         port.write(MOTOR_ON)
-        make: Callable[[float, Counter[str]], StandardDecoder | ExpressDecoder]
-        if mode == "standard":
-            make, request, header, duration = StandardDecoder, SCAN, SCAN_HEADER, rates[0] | rates[1] << 8
-        else:
-            make, request, header, duration = ExpressDecoder, EXPRESS, EXPRESS_HEADER, rates[2] | rates[3] << 8
-        if not duration:
-            raise DeviceFailure(f"the scanner has no {mode} scan")
-        _, leftover = _answer(port, request, header, 0)
-        return Session(make(duration / 1e6, dropped), leftover)
+        notes = []
+        if options["mode"] == "express":
+            found = _begin(port, EXPRESS) if express else None
+            if found is not None and found[0] == EXPRESS_HEADER[-1]:
+                return Session(ExpressDecoder(express, dropped), found[1])
+            port.write(STOP)
+            _drain(port, 0.1)
+            told = f"{_described(found)} to an express scan" if express else "tells of no express scan (old firmware)"
+            notes = [f"the scanner {told}: standard scan is used, as by mode=standard"]
+        found = _begin(port, SCAN)
+        if found is None or found[0] != SCAN_HEADER[-1]:
+            raise DeviceFailure(f"the scanner {_described(found)} to a standard scan (0x81)")
+        return Session(StandardDecoder(standard or None, dropped), found[1], notes=tuple(notes))
 
 
-def _answer(port: Port, request: bytes, header: bytes, length: int) -> tuple[bytes, bytes]:
-    """Answer of a length after its header, and what came behind it."""
-    for _ in range(5):
+def _begin(port: Port, request: bytes) -> tuple[int, bytes] | None:
+    """Data type of the scan that a request begins, and what came behind its descriptor; None where nothing begins."""
+
+    def find(received: bytes) -> tuple[int, bytes] | None:
+        match = _BEGIN.search(received)
+        return None if match is None else (match[1][0], received[match.end() :])
+
+    for _ in range(_ATTEMPTS):
         port.write(request)
-        if (answer := read_until(port, lambda received: _behind(received, header, length), _ANSWER)) is not None:
+        if (found := read_until(port, find, _ANSWER)) is not None:
+            return found
+    return None
+
+
+def _described(found: tuple[int, bytes] | None) -> str:
+    """How a scanner answers where it does not begin the scan that is read."""
+    if found is None:
+        return "does not answer"
+    return f"answers with descriptor 0x{found[0]:02x} ({_CAPSULES.get(found[0], 'unknown')}, not read)"
+
+
+def _answer(port: Port, request: bytes, header: bytes, length: int) -> bytes:
+    """Answer of a length after its header. Raises DeviceFailure, which tells what came instead."""
+    heard = b""
+
+    def find(received: bytes) -> bytes | None:
+        nonlocal heard
+        heard = received
+        begin = received.find(header) + len(header)
+        return received[begin : begin + length] if len(header) <= begin <= len(received) - length else None
+
+    for _ in range(_ATTEMPTS):
+        port.write(request)
+        if (answer := read_until(port, find, _ANSWER)) is not None:
             return answer
-    raise DeviceFailure("no answer: not an RPLIDAR, or another baud rate (115200 or 256000)")
-
-
-def _behind(received: bytes, header: bytes, length: int) -> tuple[bytes, bytes] | None:
-    begin = received.find(header) + len(header)
-    whole = begin >= len(header) and len(received) >= begin + length
-    return (received[begin : begin + length], received[begin + length :]) if whole else None
+    if (begin := heard.find(header[:2])) >= 0 and len(heard) >= begin + len(header):
+        kind = heard[begin + len(header) - 1]
+        raise DeviceFailure(f"answers with descriptor 0x{kind:02x} in place of 0x{header[-1]:02x}: no RPLIDAR we know")
+    what = "an answer that is none" if heard else "no answer"
+    speeds = ", ".join(f"{baud} {models}" for baud, models in _SPEEDS.items())
+    raise NoAnswer(f"{what}: not an RPLIDAR, no power, or another baud ({speeds}), tried in turn unless baud= is given")
 
 
 def _drain(port: Port, quiet: float) -> None:

@@ -13,13 +13,14 @@ import random
 import re
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 from urllib.parse import parse_qsl, urlsplit
 
 from uwbslam_drivers.clock import DeviceClock, host_time
-from uwbslam_drivers.device import Decoder, Device, DeviceFailure, DriverError, Option, Port
+from uwbslam_drivers.device import Decoder, Device, DeviceFailure, DriverError, NoAnswer, Option, Port, Session
 from uwbslam_drivers.dwm1000 import Dwm1000
 from uwbslam_drivers.dwm1001 import Dwm1001
 from uwbslam_drivers.hokuyo import Hokuyo
@@ -63,16 +64,20 @@ class Reading(NamedTuple):
 
 @dataclass(frozen=True)
 class Address:
-    """What a URL says: device, how to open its port, and options for it."""
+    """What a URL says: device, ways to open its port (speeds, where the URL gives none), and options for it."""
 
     url: str
     protocol: str
-    open: Callable[[], Port]
+    ways: Sequence[Callable[[], Port]]
     options: Mapping[str, str]
 
     @property
     def device(self) -> Device:
         return DEVICES[self.protocol]
+
+    def open(self, way: int = 0) -> Port:
+        """The port, opened in one of the ways; they come round again. Raises OSError."""
+        return self.ways[way % len(self.ways)]()
 
 
 def parse_url(url: str, kind: str) -> Address:
@@ -94,7 +99,7 @@ def parse_url(url: str, kind: str) -> Address:
     device = DEVICES[protocol]
     known_options = dict(device.options)
     if parts.scheme == "serial":
-        known_options["baud"] = Option(str(device.baud), r"[1-9]\d{0,7}", "a whole number greater than 0")
+        known_options["baud"] = Option(str(device.bauds[0]), r"[1-9]\d{0,7}", "a whole number greater than 0")
     for word, value in words.items():
         if word not in known_options:
             near = difflib.get_close_matches(word, known_options, 1) or sorted(["protocol", *known_options])
@@ -108,11 +113,12 @@ def parse_url(url: str, kind: str) -> Address:
         number = port or device.tcp_port
         if number is None:
             raise DriverError(f"{url}: no port; write tcp://{host}:PORT")
-        return Address(url, protocol, lambda: TcpPort(host, number), options)
+        return Address(url, protocol, [lambda: TcpPort(host, number)], options)
     if parts.scheme == "serial":
         if host or not parts.path.strip("/"):
             raise DriverError(f"{url}: no port; write serial:///dev/ttyACM0")
-        return Address(url, protocol, lambda: SerialPort(parts.path, int(options["baud"]), device.dtr), options)
+        bauds = [int(words["baud"])] if "baud" in words else device.bauds
+        return Address(url, protocol, [partial(SerialPort, parts.path, baud, device.dtr) for baud in bauds], options)
     raise DriverError(f"{url}: must begin with tcp:// or serial://")
 
 
@@ -133,6 +139,7 @@ class Source:
       status: "closed", "opening", "waiting" for the first measurement, or "streaming".
       failure: why the port was lost or cannot be opened, in one line; "" while it is open.
       counts: measurements, bytes, connections, and what was dropped, by reason.
+      notes: what a user should know of how the device talks, one line each.
     """
 
     def __init__(self, address: Address, now: Callable[[], int] = host_time):
@@ -141,6 +148,8 @@ class Source:
         self.status = "closed"
         self.failure = ""
         self.counts: Counter[str] = Counter()
+        self.notes: list[str] = []
+        self._way = 0  # to open the port: the last that led to an answer, or the next to be tried
         self._now = now
         self._stop = threading.Event()
 
@@ -168,11 +177,12 @@ class Source:
 
     def _connection(self) -> Iterator[Reading]:
         """Readings until the port fails or falls silent."""
-        port = self.address.open()
+        port = self.address.open(self._way)
         try:
             device = self.address.device
-            session = device.start(_Interruptible(port, self._stop), self.address.options, self.counts)
+            session = self._started(device, port)
             self.counts["connections"] += 1
+            self.notes += [note for note in session.notes if note not in self.notes]
             self.status, self.failure = "waiting", ""
             clock = DeviceClock(session.wrap, session.least_delay, session.reference)
             heard = measured = self._now()
@@ -194,6 +204,14 @@ class Source:
             return
         finally:
             port.close()
+
+    def _started(self, device: Device, port: Port) -> Session:
+        """The device made to talk; where nothing comes, the port is opened in its next way from now on."""
+        try:
+            return device.start(_Interruptible(port, self._stop), self.address.options, self.counts)
+        except NoAnswer:
+            self._way += 1
+            raise
 
     def _readings(self, decoder: Decoder, clock: DeviceClock, data: bytes, received: int) -> Iterator[Reading]:
         self.counts["bytes"] += len(data)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -13,16 +14,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from uwbslam_drivers import Source, dwm1000, hokuyo, open_source
+from uwbslam_drivers import Source, dwm1000, dwm1001, hokuyo, open_source, rplidar
 from uwbslam_drivers.clock import host_time
-from uwbslam_drivers.device import DriverError
+from uwbslam_drivers.device import DeviceFailure, DriverError
 from uwbslam_drivers.emulators.command import EmulateOptions, emulate
 from uwbslam_drivers.emulators.faults import Faults, Line, within
 from uwbslam_drivers.emulators.plugs import Plug, PtyPlug, TcpPlug
 from uwbslam_drivers.emulators.robot import Departure, DeviceTime
 from uwbslam_drivers.emulators.serve import EMULATORS, Server
 from uwbslam_drivers.ports import SerialPort
-from uwbslam_drivers.source import Reading, parse_url
+from uwbslam_drivers.source import DEVICES, Reading, parse_url
 from uwbslam_jax.__main__ import main
 from uwbslam_jax.evaluation import Truth
 from uwbslam_jax.measurements import RangeMessage, ScanMessage
@@ -108,6 +109,83 @@ def test_every_device_is_made_to_talk_over_its_port(name: str, query: str, tmp_p
         assert departure.at - 1 * MS <= reading.message.stamp <= reading.received
         if isinstance(reading.message, RangeMessage):
             assert reading.message.source == made.uwb.robot_id or name == "dwm1000"
+
+
+@pytest.mark.parametrize(("name", "says"), [("rplidar-c1", "0x85 (dense capsules"), ("rplidar-old", "old firmware")])
+def test_a_scanner_whose_express_scan_is_not_read_scans_all_the_same(name: str, says: str, tmp_path: Path) -> None:
+    with served(name, PtyPlug(tmp_path / name), workshop()) as (server, departure):
+        source = open_source(server.url, "lidar")
+        readings = collect(source, lambda found: len(found) >= 8)
+    (note,) = source.notes
+    assert says in note
+    assert "mode=standard" in note
+    assert not [reason for reason in source.counts if ":" in reason], source.counts
+    scans = [reading.message for reading in readings if isinstance(reading.message, ScanMessage)]
+    # of 2000 samples a second, a tenth in each turn; old firmware does not tell, and turns are read late by turns
+    assert abs(scans[-1].time_increment / 500e-6 - 1.0) < (0.1 if name == "rplidar-old" else 1e-6)
+    assert {195 < scan.ranges.size < 205 for scan in scans} == {True}
+    assert departure.at is not None
+    assert all(departure.at - 1 * MS <= scan.stamp for scan in scans)
+
+
+class Answering:
+    """A port behind which each line or request gets an answer."""
+
+    def __init__(self, answer: Callable[[bytes], bytes]):
+        self._answer, self._said = answer, b""
+
+    def read(self, timeout: float) -> bytes:
+        said, self._said = self._said, b""
+        time.sleep(0.0 if said else min(timeout, 0.01))
+        return said
+
+    def write(self, data: bytes) -> None:
+        self._said += self._answer(data)
+
+    def close(self) -> None:
+        pass
+
+
+def test_the_speeds_of_a_scanner_are_tried_in_turn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rplidar, "_ANSWER", 0.05)
+
+    def noise() -> Answering:
+        return Answering(lambda data: b"\x80")
+
+    with served("rplidar", PtyPlug(tmp_path / "scanner"), workshop()) as (server, _):
+        address = parse_url(server.url, "lidar")
+        assert len(address.ways) == 4
+        assert len(parse_url(f"{server.url}&baud=460800", "lidar").ways) == 1
+        source = Source(replace(address, ways=[noise, address.open]))
+        collect(source, lambda found: len(found) >= 2)
+    assert source.counts["connection: lost or refused"] == 1
+    source = Source(replace(address, ways=[noise]))
+    with pytest.raises(DeviceFailure, match="460800 C1, 1000000 S2, S3"):
+        source.address.device.start(source.address.open(), address.options, source.counts)
+
+
+@pytest.mark.parametrize(
+    ("protocol", "answer", "says"),
+    [
+        ("rplidar", lambda data: rplidar.RATE_HEADER + bytes(4), "descriptor 0x15 in place of 0x06"),
+        ("hokuyo", lambda data: data + b"E\n\n", "SCIP 1 only, update its firmware"),
+        ("hokuyo", lambda data: b"", "not a SCIP 2 sensor, no power"),
+        ("dwm1001", lambda data: b"\x40\x01\x01", "generic (TLV) mode"),
+        ("dwm1001", lambda data: b"", "no power, or another baud"),
+    ],
+)
+def test_a_device_that_does_not_talk_as_it_should_is_told_why(
+    protocol: str, answer: Callable[[bytes], bytes], says: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rplidar, "_ANSWER", 0.05)
+    monkeypatch.setattr(hokuyo, "_ANSWER", 0.02)
+    monkeypatch.setattr(dwm1001, "_ANSWER", 0.05)
+    monkeypatch.setattr(dwm1001, "_LISTEN", 0.05)
+    options = {name: option.default for name, option in DEVICES[protocol].options.items()}
+    with pytest.raises(DeviceFailure) as error:
+        DEVICES[protocol].start(Answering(answer), options, Counter())
+    assert says in str(error.value)
+    assert "\n" not in str(error.value)
 
 
 def test_hokuyo_stamps_are_the_times_of_the_first_beams(tmp_path: Path) -> None:

@@ -22,10 +22,14 @@ from made_result import make_result
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
+from uwbslam_drivers.emulators.plugs import PtyPlug
+from uwbslam_drivers.emulators.robot import Departure, DeviceTime
+from uwbslam_drivers.emulators.serve import EMULATORS, Server
 from uwbslam_jax.__main__ import main
 from uwbslam_jax.files.mcap_log import LogReader
 from uwbslam_jax.files.run_folder import read_run, read_trajectory
 from uwbslam_jax.measurements import ScanMessage
+from uwbslam_jax.sim import make_scenario
 from uwbslam_jax.web.report import write_report
 
 PATIENCE_S = 120.0
@@ -315,6 +319,29 @@ def test_what_a_user_can_mend_is_one_line(
     assert told.out == ""
     assert told.err.count("\n") == 1
     assert says in told.err
+
+
+@pytest.mark.slow
+def test_a_radio_alone_runs_and_says_what_it_cannot_tell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    departure = Departure()
+    device = EMULATORS["dwm1001"](DeviceTime(time.time_ns()))
+    server = Server(device, PtyPlug(tmp_path / "tag"), make_scenario("workshop", 0, 60.0), departure)
+    server.start()
+    small = ["--map.size-m", "12.8", "--lidar.max-beams", "60", "--uwb.max-beacons", "5", "--view", "off"]
+    try:
+        assert main(["live", "--uwb", server.url, "-o", str(tmp_path / "out"), "--duration", "5", *small]) == 0
+    finally:
+        server.stop()
+    told = capsys.readouterr()
+    assert told.err.count("warning: no LiDAR (--lidar URL)") == 1
+    assert "neither scans nor odometry show how the robot moves" in told.err
+    assert "has not moved" not in told.err + told.out
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["steps"] > 0
+    assert summary["ids"] == [1, 2, 3, 4, 5]
+    assert summary["status"] == "motion not known"
+    top = (tmp_path / "out" / "report.html").read_text().partition("<main>")[0]
+    assert all(warning in top for warning in summary["warnings"])
 
 
 def test_devices_that_are_not_there_are_told_at_the_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,8 +13,9 @@ import threading
 import time
 import urllib.error
 import urllib.request
+from collections import Counter
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +25,16 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from uwbslam_jax import estimator
+from uwbslam_jax.api import Slam
 from uwbslam_jax.errors import RunError, UsageError
 from uwbslam_jax.files import ros_types
 from uwbslam_jax.files.mcap_log import LogReader, LogWriter
+from uwbslam_jax.live.devices import Devices
+from uwbslam_jax.live.live_run import LiveRun
 from uwbslam_jax.live.message_queue import BEHIND_S, MOST, OVERFULL, OVERTAKEN, Arrival, Inbox
 from uwbslam_jax.mapping.tiled_map import TILE, Tiles
-from uwbslam_jax.measurements import Message, RangeMessage, ScanMessage
+from uwbslam_jax.measurements import Message, RangeMessage, ScanMessage, empty_frame
+from uwbslam_jax.reasons import Sensor
 from uwbslam_jax.session import saved_state
 from uwbslam_jax.session.frame_assembler import FrameAssembler
 from uwbslam_jax.session.saved_state import Locator, Saved
@@ -321,6 +326,72 @@ def test_a_taken_port_and_a_bad_address_are_one_line() -> None:
             parse_address(bad)
 
 
+@cache
+def blank_estimate() -> Any:
+    """Of a step that learnt nothing."""
+    session = Session(SMALL)
+    frame = empty_frame(SMALL.lidar.max_beams, session.config.max_ranges)
+    shapes = jax.eval_shape(partial(estimator.step, session.config), session.params, session.state, frame)[1]
+    return jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
+
+
+def notices(page: LivePage) -> str:
+    return json.loads(page.words()[1])["notices"]
+
+
+def test_a_page_of_radios_alone_waits_for_no_scan_and_for_no_motion() -> None:
+    page, session = LivePage("x", scans=False), Session(SMALL)
+    assert "Waiting for the first range." in page.whole()
+    page.tell(Status(troubles=["no LiDAR"]))  # before anything was measured
+    assert "no LiDAR" in notices(page)
+    frames = FrameAssembler(SMALL, session.config.max_ranges)
+    ranged, scanned = (*frames.add(RangeMessage(T0, 0, 1, 2.0)), *frames.flush(), *frames.add(scan(T0 + SECOND)))
+    nothing = blank_estimate()
+    page.step(session, session.update(ranged, nothing), Status())
+    assert "nothing shows how the robot moves" in notices(page)
+    page.step(session, session.update(scanned, nothing), Status())
+    assert "Waiting for motion" in notices(page)
+    page = LivePage("x")
+    page.step(session, session.update(ranged, nothing), Status())
+    assert "Waiting for the first scan." in notices(page)
+
+
+def test_warnings_of_a_live_run_are_told_when_they_arise_and_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[str] = []
+    devices = Devices(None, ["tcp://127.0.0.1:1?protocol=dwm1001"])
+    source = devices.sources["uwb"]
+    source.status, source.notes = "streaming", ["a note"]
+    run = LiveRun(Slam(SMALL, fit=False), devices, tmp_path / "live.mcap", tell=told.append)
+    few, many = Counter({OVERTAKEN: 10}), Counter({OVERTAKEN: 80})
+    assert run._warn(few) == told
+    assert [line[:8] for line in told] == ["no LiDAR", "uwb: a n"]
+    source.status, source.failure = "opening", "refused"
+    assert len(run._warn(few)) == 2  # it may be there in a moment
+    now = time.monotonic()
+    monkeypatch.setattr(time, "monotonic", lambda: now + 10.0)
+    assert run._warn(few)[-1] == told[-1] == devices.troubles()[0]
+    source.status, source.failure = "streaming", ""
+    assert run._warn(many)[-1] == told[-1]
+    assert told[-1].startswith("all 80 scans were left out")
+    run._warn(Counter({OVERTAKEN: 90}))
+    assert len(told) == len(run.told) == 4
+    assert run.told[Sensor.SCAN].startswith("all 90 scans")
+    run._recorder.close()
+
+
+def test_a_device_that_sends_what_is_not_understood_is_told_so() -> None:
+    devices = Devices(None, ["tcp://127.0.0.1:1?protocol=dwm1001"])
+    source = devices.sources["uwb"]
+    source.status = "waiting"
+    source.counts["bytes"] = 700
+    assert "700 bytes came, no measurement among them" in devices.troubles()[0]
+    assert devices.silent() == [f"nothing was measured: {devices.troubles()[0]}"]
+    source.counts["measurements"] = 1
+    assert not devices.silent()
+
+
 def test_texts_of_devices_stay_texts() -> None:
     page = LivePage("x")
     page._status = Status(troubles=["uwb is <script>alert(1)</script>"])
@@ -353,9 +424,7 @@ def test_published_poses_reach_a_foxglove_client() -> None:
 
     session = Session(SMALL)
     (frame,) = FrameAssembler(SMALL, session.config.max_ranges).add(scan(T0))
-    shapes = jax.eval_shape(partial(estimator.step, session.config), session.params, session.state, frame.frame)[1]
-    estimate: Any = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
-    estimate = estimate._replace(pose=np.array([1.25, -2.5, 0.5], np.float32))
+    estimate = blank_estimate()._replace(pose=np.array([1.25, -2.5, 0.5], np.float32))
     publisher = Publisher("127.0.0.1", 0)
     try:
         address = publisher.url.removeprefix("ws://").split(":")

@@ -3,26 +3,30 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 from uwbslam_jax.api import Result
 
 
-def deliver(result: Result, out: Path, title: str) -> None:
-    """Writes every file of a run into a folder and prints its figures.
+def deliver(result: Result, out: Path, title: str, told: Collection[str] = ()) -> None:
+    """Writes every file of a run into a folder and prints its figures, and the warnings that were not told before.
 
     Raises:
       OSError: a file cannot be written.
     """
     result.save(out, title)
-    for warning in result.summary["warnings"]:
-        print(f"warning: {warning}", file=sys.stderr)
-    if result.summary["truncated"]:
-        print(f"warning: {result.summary['truncated']}", file=sys.stderr)
+    for warning in [*result.summary["warnings"], *filter(None, [result.summary["truncated"]])]:
+        if warning not in told:
+            warn(warning)
     print(table([*accuracy(result.summary), *effort(result)]))
     print(f"report: {out / 'report.html'}")
+
+
+def warn(line: str) -> None:
+    """Prints a warning where it is seen at once, also beside output that goes elsewhere."""
+    print(f"warning: {line}", file=sys.stderr, flush=True)
 
 
 def accuracy(figures: dict[str, Any]) -> Iterator[tuple[str, str]]:

@@ -19,7 +19,7 @@ import tyro
 from tyro.conf import arg
 
 from uwbslam_jax.api import Slam
-from uwbslam_jax.cli.finish_run import deliver
+from uwbslam_jax.cli.finish_run import deliver, warn
 from uwbslam_jax.errors import UsageError
 from uwbslam_jax.evaluation import Truth
 from uwbslam_jax.files import settings_file
@@ -34,7 +34,8 @@ Foxglove's own, 8765, is taken by the view."""
 _EMULATE = """\
 import ctypes, sys
 from uwbslam_jax.__main__ import main
-ctypes.CDLL(None).prctl(1, 15)  # PR_SET_PDEATHSIG: ends when we do, even if we are killed
+if sys.platform == "linux":
+    ctypes.CDLL(None).prctl(1, 15)  # PR_SET_PDEATHSIG: ends when we do, even if we are killed
 main(sys.argv[1:])
 """
 """Program that runs the emulators [Python]: a process of its own, for it must not slow the run down."""
@@ -53,7 +54,7 @@ class LiveOptions:
     out: Annotated[Path, arg(aliases=["-o"])]
     """Folder for recording and files; it is created. A recording that is there is never overwritten."""
     lidar: str | None = None
-    """URL of the LiDAR; by default a Hokuyo's protocol."""
+    """URL of the LiDAR; by default a Hokuyo's protocol. Without, the radios' ranges are all there is."""
     uwb: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """URL of a UWB radio, by default in our line protocol; may be given several times."""
     emulate: str | None = None
@@ -81,7 +82,7 @@ def live(options: LiveOptions) -> None:
       LogError, RunError, OSError: a file that cannot be used.
     """
     settings = _check(options)
-    devices = None if options.lidar is None else Devices(options.lidar, options.uwb)
+    devices = None if options.emulate is not None else Devices(options.lidar, options.uwb)
     slam = Slam(settings, resume=options.resume, localize=options.localize, fit=False)
     options.out.mkdir(parents=True, exist_ok=True)
     with contextlib.ExitStack() as ends, _until_stopped(options.duration) as go:
@@ -93,7 +94,7 @@ def live(options: LiveOptions) -> None:
         if not go():
             raise KeyboardInterrupt
         recording = options.out / f"live-{datetime.now(UTC):%Y%m%d-%H%M%S}.mcap"
-        run = LiveRun(slam, devices, recording, page=page, publisher=publisher)
+        run = LiveRun(slam, devices, recording, page=page, publisher=publisher, tell=warn)
         print(f"recording to {recording}; Ctrl-C ends", flush=True)
         result = run.run(go)
         if not result.summary["steps"]:
@@ -101,7 +102,7 @@ def live(options: LiveOptions) -> None:
     truth = options.out / _TRUTH
     if options.emulate is not None and truth.exists() and len(result.stamps):
         result.truth = Truth.load(truth)
-    deliver(result, options.out, f"UWB and LiDAR SLAM: {recording.name}")
+    deliver(result, options.out, f"UWB and LiDAR SLAM: {recording.name}", set(run.told.values()))
     print(_losses(result.summary))
 
 
@@ -122,7 +123,7 @@ def _check(options: LiveOptions) -> Settings:
             raise UsageError("--emulate brings its own devices: leave --lidar and --uwb out")
         if options.emulate not in SCENARIOS:
             raise UsageError(f"no world {options.emulate}; there are {', '.join(SCENARIOS)}")
-    elif options.lidar is None:
+    elif options.lidar is None and not options.uwb:
         raise UsageError("no device: give --lidar URL and --uwb URL, or --emulate workshop to try it without any")
     settings = options.settings
     if options.emulate is not None:  # what a user would configure for this robot
@@ -140,7 +141,7 @@ def _outputs(options: LiveOptions, ends: contextlib.ExitStack) -> tuple[LivePage
     host, page, publisher = _LOOPBACK, None, None
     if options.view != "off":
         host, port = parse_address(options.view)
-        page = LivePage("UWB and LiDAR SLAM, live")
+        page = LivePage("UWB and LiDAR SLAM, live", scans=options.lidar is not None or options.emulate is not None)
         view = LiveView(page, host, port)
         ends.callback(view.close)
         print(f"live view: {view.url}", flush=True)

@@ -26,6 +26,7 @@ from uwbslam_jax.errors import LogError
 from uwbslam_jax.files.mcap_container import Channel
 from uwbslam_jax.files.ros_types import STORE, UWB_RANGE
 from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, ScanMessage, TruthMessage
+from uwbslam_jax.reasons import OdometryLost, RangeLost, ScanLost
 
 Role = Literal["scan", "uwb", "odom", "truth"]
 Decoder = Callable[[bytes, int], list[Message]]
@@ -46,6 +47,13 @@ SUPPORTED: dict[Role, str] = {
 """Types that are read [role -> text], for an error about another one."""
 _WORDS: dict[Role, str] = {"scan": "scan", "uwb": "range", "odom": "odometry", "truth": "ground truth"}
 """What messages call a role [role -> text]."""
+_MALFORMED_AS: dict[Role, str] = {
+    "scan": ScanLost.MALFORMED,
+    "uwb": RangeLost.MALFORMED,
+    "odom": OdometryLost.MALFORMED,
+    "truth": "ground truth: malformed",
+}
+"""How a message that does not decode is counted [role -> reason]."""
 _FIELDS: dict[Role, dict[str, set[str]]] = {
     "scan": {
         "ros": {"angle_min", "angle_increment", "time_increment", "range_min", "range_max", "ranges"},
@@ -96,13 +104,13 @@ def make_decoder(channel: Channel, role: Role, options: Options) -> Decoder:
         )
     if _is_our_range(channel):
         return _fast_range(options)
-    take = _TAKE[role]
+    take, malformed = _TAKE[role], _MALFORMED_AS[role]
 
     def decode(data: bytes, log_time: int) -> list[Message]:
         try:
             return take(unpack(data), log_time, options)
         except _MALFORMED:
-            options.dropped[f"{_WORDS[role]}: malformed"] += 1
+            options.dropped[malformed] += 1
             return []
 
     return decode
@@ -178,7 +186,7 @@ def _fast_range(options: Options) -> Decoder:
             source, target, *values = tails[data[1]].unpack_from(data, 16 + (length + 3 & ~3))
             stamp = sec * 1_000_000_000 + nanosec or log_time
         except (struct.error, IndexError, ValueError):
-            options.dropped["range: malformed"] += 1
+            options.dropped[RangeLost.MALFORMED] += 1
             return []
         return _checked(RangeMessage(stamp, source, target, *values), options)
 
@@ -188,11 +196,11 @@ def _fast_range(options: Options) -> Decoder:
 def _checked(found: RangeMessage, options: Options) -> list[Message]:
     """The one range as a list, empty and counted where it cannot be a distance between two nodes."""
     if not 0.0 < found.range < math.inf:
-        options.dropped["range: not finite or not positive"] += 1
+        options.dropped[RangeLost.NOT_POSITIVE] += 1
     elif found.range > options.max_range:
-        options.dropped[f"range: over {options.max_range:g} m"] += 1
+        options.dropped[RangeLost.over(options.max_range)] += 1
     elif found.source == found.target:
-        options.dropped["range: from a node to itself"] += 1
+        options.dropped[RangeLost.FROM_SELF] += 1
     else:
         return [found]
     return []
@@ -211,7 +219,7 @@ def _stamp(message: Any, log_time: int) -> int:
 def _take_scan(message: Any, log_time: int, options: Options) -> list[Message]:
     ranges = np.array(message.ranges, dtype=np.float32).reshape(-1)
     if ranges.size == 0:
-        options.dropped["scan: no beams"] += 1
+        options.dropped[ScanLost.NO_BEAMS] += 1
         return []
     if hasattr(message, "start_angle"):  # foxglove: the sweep's two ends, no limits, taken at once
         angle_min, time_increment, limits = float(message.start_angle), 0.0, (0.0, math.inf)
@@ -255,7 +263,7 @@ def _take_odometry(message: Any, log_time: int, options: Options) -> list[Messag
     pose = message.pose.pose
     x, y, yaw = float(pose.position.x), float(pose.position.y), _yaw(pose.orientation)
     if not all(map(math.isfinite, (x, y, yaw))):
-        options.dropped["odometry: not finite"] += 1
+        options.dropped[OdometryLost.NOT_FINITE] += 1
         return []
     return [OdometryMessage(_stamp(message, log_time), x, y, yaw)]
 

@@ -17,10 +17,10 @@ class Devices:
       defect: an error that no device explains; the run ends with it.
     """
 
-    def __init__(self, lidar: str, uwb: Sequence[str]):
-        """Reads the URLs; nothing is opened yet. Raises DriverError."""
+    def __init__(self, lidar: str | None, uwb: Sequence[str]):
+        """Reads the URLs, None for no LiDAR; nothing is opened yet. Raises DriverError."""
         names = ["uwb"] if len(uwb) == 1 else [f"uwb {k + 1}" for k in range(len(uwb))]
-        self.sources: dict[str, Source] = {"lidar": open_source(lidar, "lidar")}
+        self.sources: dict[str, Source] = {} if lidar is None else {"lidar": open_source(lidar, "lidar")}
         self.sources |= {name: open_source(url, "uwb") for name, url in zip(names, uwb, strict=True)}
         self.defect: BaseException | None = None
         self._threads: list[threading.Thread] = []
@@ -50,8 +50,21 @@ class Devices:
 
     def troubles(self) -> list[str]:
         """Devices that do not deliver, one line each."""
-        return [
-            f"{name} ({source.address.url}) is {source.status}{': ' if source.failure else ''}{source.failure}"
-            for name, source in self.sources.items()
-            if source.status != "streaming"
-        ]
+        return [_trouble(name, source) for name, source in self.sources.items() if source.status != "streaming"]
+
+    def notes(self) -> list[str]:
+        """How devices talk, where a user should know, one line each."""
+        return [f"{name}: {note}" for name, source in self.sources.items() for note in source.notes]
+
+    def silent(self) -> list[str]:
+        """Devices that have not delivered anything, one line each."""
+        lost = [(name, source) for name, source in self.sources.items() if not source.counts["measurements"]]
+        return [f"nothing was measured: {_trouble(name, source)}" for name, source in lost]
+
+
+def _trouble(name: str, source: Source) -> str:
+    """A device that does not deliver, and why as far as it is known."""
+    why = source.failure
+    if not why and source.status == "waiting" and source.counts["bytes"]:
+        why = f"{source.counts['bytes']} bytes came, no measurement among them; another protocol, mode or baud?"
+    return f"{name} ({source.address.url}) is {source.status}{': ' if why else ''}{why}"

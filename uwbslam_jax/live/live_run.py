@@ -27,12 +27,18 @@ from uwbslam_jax.measurements import ScanMessage
 from uwbslam_jax.session import Facts, Saved, Update, saved_state
 from uwbslam_jax.web import LivePage, Status
 
+_MANY_LOST = 50
+"""Losses are told along the way once they are so many [measurements]: the first seconds are no fifth of a run."""
+_LASTING_S = 3.0
+"""A device that does not deliver for so long is told of [s]: longer than most take to begin or to be found again."""
 _IDLE_S, _STATUS_S, _SAVE_S = 0.05, 0.5, 10.0
 """Time between two looks at `go`, two figures for the page, two saved states, of which a killed run loses one [s]."""
 _RECENT = 400
 """Latencies that the figures on the page are of [scans]: enough for a 99 % quantile, few enough to be recent."""
 _SWITCH_S = 0.5e-3
 """A thread that waits for the interpreter gets it after so long: with 5 ms, three threads cost a scan's period [s]."""
+_NO_LIDAR = "no LiDAR (--lidar URL): ranges alone give no track and no map, only where nodes at rest are to each other"
+"""Warning [text]."""
 _NO_LOSS = {"measurements", "bytes", "connections"}
 """What devices count that is no measurement lost [names]."""
 
@@ -42,6 +48,7 @@ class LiveRun:
 
     Attributes:
       recording: path of the MCAP file.
+      told: what a user was told while it ran, in order: subject -> line.
     """
 
     def __init__(
@@ -52,18 +59,23 @@ class LiveRun:
         *,
         page: LivePage | None = None,
         publisher: Publisher | None = None,
+        tell: Callable[[str], object] = lambda line: None,
     ):
         """Opens the recording.
 
         Args:
           slam: the run, with room for lidar.max_beams beams.
           page, publisher: get each step.
+          tell: called with each warning when it arises, once for each subject.
 
         Raises:
           LogError: the recording cannot be opened.
         """
         self.recording = recording
         self._slam, self._devices, self._page, self._publisher = slam, devices, page, publisher
+        self.told: dict[object, str] = {}
+        self._tell = tell
+        self._troubles: dict[str, float] = {}  # that there are, since when
         slam.on_update = self._publish
         self._recorder = LogRecorder(recording, slam.settings)
         self._queue = Inbox(self._recorder.record)
@@ -133,11 +145,35 @@ class LiveRun:
         self._measured = measured
         recent = np.array(self._latency_ms[-_RECENT:])
         latency = (float(np.median(recent)), float(np.percentile(recent, 99))) if len(recent) else None
-        troubles = self._devices.troubles()
-        troubles += [f"recording: {self._recorder.failure}"] if self._recorder.failure else []
-        self._status = Status(rates, dict(self._dropped() + self._slam.runner.not_located), latency, troubles)
+        dropped = self._dropped()
+        warnings = self._warn(dropped)
+        troubles = [line for line in self._devices.troubles() if line not in warnings]
+        told = dict(dropped + self._slam.runner.not_located)
+        self._status = Status(rates, told, latency, [*troubles, *warnings])
+        if self._page is not None:
+            self._page.tell(self._status)
         if now - self._saved_at > _SAVE_S and self._save(wait=False):
             self._saved_at = now
+
+    def _warn(self, dropped: Counter[str]) -> list[str]:
+        """What a user should know by now, one line each; what was not told yet is told."""
+        found: dict[object, str] = {} if "lidar" in self._devices.sources else {"lidar": _NO_LIDAR}
+        found |= {line: line for line in self._devices.notes()}
+        found |= {line: line for line in self._lasting(self._devices.troubles())}
+        if self._recorder.failure:
+            found["recording"] = f"recording: {self._recorder.failure}"
+        found |= self._slam.runner.warnings(dropped, _MANY_LOST)
+        for subject, line in found.items():
+            if subject not in self.told:
+                self._tell(line)
+            self.told[subject] = line
+        return list(found.values())
+
+    def _lasting(self, lines: list[str]) -> list[str]:
+        """Of the troubles that there are now, those that have been for a while."""
+        now = time.monotonic()
+        self._troubles = {line: self._troubles.get(line, now) for line in lines}
+        return [line for line, since in self._troubles.items() if now - since > _LASTING_S]
 
     def _save(self, *, wait: bool) -> bool:
         """Writes the state in a thread, which may be waited for. False where there is nothing to save, before the frame
@@ -170,6 +206,7 @@ class LiveRun:
     def _complete(self, result: Result) -> None:
         """Adds to the Result what only a live run knows."""
         summary, most = result.summary, self._slam.settings.lidar.max_beams
+        summary["warnings"] += self._devices.notes() + self._devices.silent()
         if self._recorder.failure:
             summary["warnings"].append(f"recording: {self._recorder.failure}")
         if self._beams and max(self._beams) != most:

@@ -12,13 +12,14 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from uwbslam_jax.measurements import Message, ScanMessage
+from uwbslam_jax.reasons import ScanLost
 
 BEHIND_S = 0.7
 """Once a scan has waited for so long, only the newest one is taken until the loop has caught up [s]."""
 MOST = 4096
 """Messages that wait [messages], several seconds of all devices; more are dropped, the oldest first."""
-OVERTAKEN, OVERFULL = "scan: overtaken by a newer one", "message: the queue is full"
-"""Reasons of a loss in `Inbox.dropped` [text]."""
+OVERTAKEN, OVERFULL = ScanLost.OVERTAKEN, "message: the queue is full"
+"""Reasons of a loss in `Inbox.dropped` [text]; of which sensor, only the first knows."""
 
 
 class Arrival(NamedTuple):

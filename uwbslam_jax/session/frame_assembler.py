@@ -26,6 +26,7 @@ from uwbslam_jax.measurements import (
     TruthMessage,
 )
 from uwbslam_jax.numerics import between, wrapped
+from uwbslam_jax.reasons import OdometryLost, RangeLost, ScanLost, Sensor
 from uwbslam_jax.settings import Settings
 
 _SCANLESS_S = 1.0
@@ -50,7 +51,7 @@ class FrameAssembler:
 
     Attributes:
       slots: node id -> slot, the robot 0; filled as ids are heard.
-      dropped: what was not used, by reason.
+      dropped: what was not used, by reason. used: what was, by sensor. blank: scans of these without a return.
       warnings: one line each; that there are more beacons than slots is told once.
       odometry_used: whether any frame carried an increment.
     """
@@ -58,6 +59,8 @@ class FrameAssembler:
     def __init__(self, settings: Settings, max_ranges: int):
         self.slots: dict[int, int] = {settings.robot.id: 0}
         self.dropped: Counter[str] = Counter()
+        self.used: Counter[Sensor] = Counter()
+        self.blank = 0
         self.warnings: list[str] = []
         self.odometry_used = False
         self._settings = settings
@@ -99,11 +102,12 @@ class FrameAssembler:
             self._intervals.append(scan.stamp - self._scan_at)
         self._scan_at = max(scan.stamp, self._scan_at or scan.stamp)
         if self._last is not None and scan.stamp <= self._last:
-            self.dropped["scan: stamp not after the one before"] += 1
+            self.dropped[ScanLost.STAMP] += 1
             return []
         if scan.ranges.size < 2 or not np.isfinite([scan.angle_min, scan.angle_increment]).all():
-            self.dropped["scan: no beams or no bearings"] += 1
+            self.dropped[ScanLost.NO_BEARINGS] += 1
             return []
+        self.used[Sensor.SCAN] += 1
         waiting = self._without_scan(before=scan.stamp)
         self._wait_s = _SCANLESS_S
         late = [m for m in self._ranges if m.stamp > scan.stamp]
@@ -113,21 +117,22 @@ class FrameAssembler:
 
     def _add_range(self, message: RangeMessage) -> list[StampedFrame]:
         if not (np.isfinite(message.range) and 0.0 < message.range <= self._settings.uwb.max_range):
-            self.dropped["range: not finite, not positive or too long"] += 1
+            self.dropped[RangeLost.IMPOSSIBLE] += 1
             return []
         if message.source == message.target:
-            self.dropped["range: a node to itself"] += 1
+            self.dropped[RangeLost.SELF] += 1
             return []
         pair = (min(message.source, message.target), max(message.source, message.target))
         if message.stamp <= self._newest_range.get(pair, -1):
-            self.dropped["range: stamp not after the pair's one before"] += 1
+            self.dropped[RangeLost.STAMP] += 1
             return []
         if self._last is not None and message.stamp <= self._last - int(0.5e9):
-            self.dropped["range: arrived too late"] += 1
+            self.dropped[RangeLost.LATE] += 1
             return []
         if self._slot(message.source) is None or self._slot(message.target) is None:
-            self.dropped["range: more beacons than max_beacons"] += 1
+            self.dropped[RangeLost.NO_SLOT] += 1
             return []
+        self.used[Sensor.RANGE] += 1
         self._newest_range[pair] = message.stamp
         self._ranges.append(message)
         # where there is odometry it makes the frames; one that lags is waited for, or they would lack its increment
@@ -140,11 +145,12 @@ class FrameAssembler:
         if not self._settings.odom.use:
             return []
         if not np.isfinite([message.x, message.y, message.yaw]).all():
-            self.dropped["odometry: not finite"] += 1
+            self.dropped[OdometryLost.NOT_FINITE] += 1
             return []
         if self._odometry and message.stamp <= self._odometry[-1].stamp:
-            self.dropped["odometry: stamp not after the one before"] += 1
+            self.dropped[OdometryLost.STAMP] += 1
             return []
+        self.used[Sensor.ODOMETRY] += 1
         self._odometry.append(message)
         return self._by_odometry(message.stamp)  # the newest waits for the ranges of its own time
 
@@ -200,7 +206,8 @@ class FrameAssembler:
         dt = 0.0 if self._last is None else (stamp - self._last) / 1e9
         odometry = self._increment(stamp)
         if len(ranges) > self._max_ranges:
-            self.dropped["range: more than one frame holds"] += len(ranges) - self._max_ranges
+            self.dropped[RangeLost.FRAME_FULL] += len(ranges) - self._max_ranges
+            self.used[Sensor.RANGE] -= len(ranges) - self._max_ranges
             ranges = ranges[-self._max_ranges :]
         frame = Frame(
             dt=np.float32(dt),
@@ -209,6 +216,7 @@ class FrameAssembler:
             ranges=pad_ranges(ranges, self.slots, stamp, self._max_ranges),
             odometry=odometry,
         )
+        self.blank += scan is not None and not frame.scan.valid.any()
         self._last = stamp
         return StampedFrame(stamp, frame, dict(self.slots))
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import resource
 from array import array
 from collections import Counter
 from dataclasses import dataclass, field
@@ -11,10 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from uwbslam_jax import __version__
+from uwbslam_jax import __version__, process
 from uwbslam_jax.numerics import turned
-from uwbslam_jax.result import BeaconEstimate, BeaconStatus, Result
+from uwbslam_jax.reasons import Sensor
+from uwbslam_jax.result import BeaconEstimate, BeaconStatus, Result, RunStatus
 from uwbslam_jax.session.history import History
+from uwbslam_jax.session.losses import blank_scans, losses, unplaced
 from uwbslam_jax.session.session import Session
 from uwbslam_jax.session.update import scan_points
 from uwbslam_jax.startup import Relative
@@ -24,7 +25,7 @@ _NO_SCAN = "no scan: the track is that of odometry and ranges, the map is empty"
 _NO_TRACK = "no scan and no odometry: there is no track, the map is empty"
 """Warning [text]."""
 _RELATIVE = "the robot has not moved: beacons are placed among themselves, rotation and reflection are arbitrary"
-"""Warning [text]."""
+"""Warning [text]; said where scans, odometry or the ranges themselves show it, see Runner.relative."""
 
 
 @dataclass
@@ -33,7 +34,8 @@ class Facts:
 
     Attributes:
       warnings: one line each.
-      dropped: measurements left out, by reason.
+      used, dropped: measurements that went into frames, by sensor, and that were left out, by reason.
+      blank: scans that were used and held no return.
       truncated: where the recording breaks, None where it does not.
       odometry_used: whether any frame carried an increment.
       wall_s, compile_s: time taken, and how much of it JAX compiled [s].
@@ -42,7 +44,9 @@ class Facts:
     """
 
     warnings: list[str] = field(default_factory=list)
+    used: Counter[Sensor] = field(default_factory=Counter)
     dropped: Counter[str] = field(default_factory=Counter)
+    blank: int = 0
     truncated: str | None = None
     odometry_used: bool = False
     wall_s: float = 0.0
@@ -61,8 +65,11 @@ def to_result(session: Session, facts: Facts) -> Result:
     scans = bool(history.has_scan.values.any())
     kept = history.has_scan.values if scans or not facts.odometry_used else np.ones(len(history.stamps), bool)
     at = slice(None) if kept.all() else np.flatnonzero(kept)  # nothing is copied where it is all of them
-    told = [] if scans else [_NO_SCAN if facts.odometry_used else _NO_TRACK]
+    beacons = _beacons(session, session.ids) if facts.relative is None else _relative_beacons(session, facts.relative)
+    told = [*losses(facts.used, facts.dropped).values(), *blank_scans(facts.used[Sensor.SCAN], facts.blank)]
+    told += [] if scans else [_NO_SCAN if facts.odometry_used else _NO_TRACK]
     told += [] if facts.relative is None else [_RELATIVE]
+    told += [] if beacons else _unplaced(session, facts)
     told += _biases(session)
     facts = dataclasses.replace(facts, warnings=[*facts.warnings, *told])
     stamps = history.stamps.values[at]
@@ -78,7 +85,7 @@ def to_result(session: Session, facts: Facts) -> Result:
         poses=track[at],
         online=online[at],
         online_covs=history.covs.values[at],
-        beacons=_beacons(session, ids) if facts.relative is None else _relative_beacons(session, facts.relative),
+        beacons=beacons,
         beacon_tracks=_tracks(history, ids, start),
         map=session.map(),
         range_residuals=_residuals(history, ids, start),
@@ -105,6 +112,23 @@ def _tracks(history: History, ids: dict[int, int], start: int) -> dict[int, np.n
         own = rows[rows["slot"] == slot]
         tracks[ids[slot]] = np.column_stack([(own["stamp"] - start) / 1e9, own["x"], own["y"], own["s"]])
     return tracks
+
+
+def _seen(session: Session, facts: Facts) -> bool:
+    """Whether odometry, or scans of which most fit the map, showed how the robot moves."""
+    history = session.history
+    scans, told = history.has_scan.values, history.diagnostics
+    fits = scans & (told["match_score"] > 0) & (told["poor_match"] == 0) if len(scans) else scans
+    return facts.odometry_used or bool(2 * fits.sum() > scans.sum() > 0)
+
+
+def _unplaced(session: Session, facts: Facts) -> list[str]:
+    """A warning where no beacon was placed although ranges were wanted; that all were lost is told already."""
+    used, lost = facts.used[Sensor.RANGE], Sensor.RANGE in losses(facts.used, facts.dropped)
+    if session.settings.filter.lidar_only or (lost and not used):
+        return []
+    robot, seen = session.settings.robot.id, _seen(session, facts)
+    return [unplaced(session.status, robot, ranges=used, seen=seen)]
 
 
 def _biases(session: Session) -> list[str]:
@@ -201,6 +225,7 @@ def _summary(session: Session, facts: Facts) -> dict[str, Any]:
     total = {name: int(np.sum(values)) for name, values in history.diagnostics.items()}
     rejected = {"not in line of sight": total.get("ranges_nlos", 0), "doubted": total.get("ranges_doubted", 0)}
     used = total.get("ranges_used", 0)
+    unseen = session.status is RunStatus.WAITING and facts.relative is None and not _seen(session, facts)
     rejected["node not placed"] = total.get("ranges", 0) - used - sum(rejected.values())
     return {
         "steps": len(stamps),
@@ -210,12 +235,12 @@ def _summary(session: Session, facts: Facts) -> dict[str, Any]:
         "step_ms_median": float(np.median(step_ms)) if step_ms else None,
         "step_ms_p95": float(np.percentile(step_ms, 95)) if step_ms else None,
         "real_time_factor": duration / max(facts.wall_s - facts.compile_s, 1e-9),
-        "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,  # kB on Linux
+        "peak_rss_mb": process.peak_mb(),
         "decided_at": decided,
         "frame_beacons": None if decided is None else _frame_beacons(session),
         "relative": _relative_summary(facts.relative),
         "hypotheses": session.hypotheses,
-        "status": session.status,
+        "status": RunStatus.UNSEEN if unseen else session.status,
         "ids": sorted(node for node, slot in session.slots.items() if slot > 0),
         "odometry_used": facts.odometry_used,
         "poor_matches": total.get("poor_match", 0),

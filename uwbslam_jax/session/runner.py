@@ -15,8 +15,10 @@ from uwbslam_jax.estimator import CompileClock
 from uwbslam_jax.evaluation import ROBOT, TRUTH, Truth, truth_row
 from uwbslam_jax.measurements import Message, ScanMessage, StampedFrame, TruthMessage
 from uwbslam_jax.numerics import Column
+from uwbslam_jax.reasons import Sensor
 from uwbslam_jax.result import Result, RunStatus
 from uwbslam_jax.session.frame_assembler import FrameAssembler
+from uwbslam_jax.session.losses import losses
 from uwbslam_jax.session.result_builder import Facts, to_result
 from uwbslam_jax.session.saved_state import Locator, Saved
 from uwbslam_jax.session.session import CONTROL_EVERY, Session
@@ -107,6 +109,8 @@ class Runner:
         told = dataclasses.replace(
             facts,
             warnings=warnings,
+            used=self._assembler.used,
+            blank=self._assembler.blank,
             dropped=dropped,
             odometry_used=self._assembler.odometry_used,
             step_ms=self._step_ms,
@@ -114,11 +118,19 @@ class Runner:
         )
         return to_result(self.session, told)
 
+    def warnings(self, dropped: Counter[str], least: int = 1) -> dict[Sensor | str, str]:
+        """What a user should know by now, one line each, by what it is about. dropped, least: see losses."""
+        told: dict[Sensor | str, str] = {text: text for text in self._assembler.warnings}
+        return told | losses(self._assembler.used, dropped + self._assembler.dropped, least)
+
     def relative(self) -> Relative | None:
-        """Geometry of the nodes among themselves while the robot rests; None where the ranges do not fix one."""
+        """Geometry of the nodes among themselves while the robot rests; None where the ranges do not fix one, or show
+        that it does not rest."""
         if self.session.decided_at is not None or self.session.status is not RunStatus.WAITING:
             return None
         settings = self.session.settings
+        if self._links.moving(settings.robot.id):
+            return None
         return static_geometry.solve(
             self._links.averages(), self._links.rise, origin=settings.robot.id, fit_offset=settings.uwb.fit_offset
         )

@@ -36,6 +36,9 @@ _RANDOM_STARTS = 8
 _OFFSET_SHARES = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98)
 """Starts of an unknown common offset, as shares of the shortest range."""
 
+_RESTING_M = 1.0
+"""Ranges of nodes at rest are spread over less, but for gross outliers [m]: behind walls they jump by decimetres."""
+
 Pair = tuple[int, int]
 
 
@@ -75,6 +78,14 @@ class Links:
         """One range [m] between two nodes, what is known of its bias taken off; in_sight: by the power rule."""
         pair = (min(a, b), max(a, b))
         self._ranges.setdefault(pair, deque(maxlen=_KEPT)).append((distance, in_sight))
+
+    def moving(self, robot: int) -> bool:
+        """Whether most ranges of a node (the robot where it is heard, otherwise any) show that it does not rest."""
+        middle = (0.1, 0.9)
+        spread = {pair: np.ptp(np.quantile([d for d, _ in kept], middle)) for pair, kept in self._ranges.items()}
+        nodes = {node for pair in spread for node in pair}
+        own = [[m for pair, m in spread.items() if node in pair] for node in ({robot} & nodes or nodes)]
+        return any(float(np.median(spreads)) > _RESTING_M for spreads in own)
 
     def averages(self) -> dict[Pair, Link]:
         """Every pair's median, without its gross outliers.

@@ -38,6 +38,8 @@ _HINTS = {
     RunStatus.UNDECIDED: "Reflection undecided: the ranges fit a mirrored place as well until the robot turns.",
 }
 """What helps a run whose frame is not decided [status -> text]."""
+_UNSEEN = "No scan and no odometry so far: nothing shows how the robot moves."
+"""Says it in place of a hint to drive [text]."""
 _COLUMNS = ("t", "x", "y", "yaw", "xx", "xy", "yy")
 """Columns of the track, as map.js names them [s, m, m, rad, m^2, m^2, m^2]."""
 
@@ -52,7 +54,7 @@ class Status:
     Attributes:
       rates: of each device by name [1/s]; dropped: by reason.
       latency_ms: scan arrival to published pose, median and 99 % of the last few hundred; None before the first.
-      troubles: what a user should repair, one line each.
+      troubles: what a user should repair or know, one line each.
     """
 
     rates: dict[str, float] = field(default_factory=dict)
@@ -79,8 +81,12 @@ class LivePage:
       watched: whether anybody looks; without, nothing is copied.
     """
 
-    def __init__(self, title: str):
+    def __init__(self, title: str, *, scans: bool = True):
+        """scans: whether a LiDAR is there; time then counts from its first scan, as in the report."""
         self.title = title
+        self._scans = scans
+        self._first = f"Waiting for the first {'scan' if scans else 'range'}."
+        self._motion = False  # whether anything has shown it
         self.watched = False
         self._now: _Now | None = None
         self._sent: _Now | None = None
@@ -100,9 +106,10 @@ class LivePage:
     def step(self, session: Session, update: Update, status: Status) -> None:
         """Takes in one step; called by the loop."""
         if self._start is None:
-            if update.score is None:
-                return  # time counts from the first scan, as in the report
+            if self._scans and update.score is None:
+                return
             self._start = update.stamp
+        self._motion = self._motion or update.score is not None or bool(update.frame.frame.odometry.valid)
         t = (update.stamp - self._start) / 1e9
         before = self._now
         self._links |= {pair: (t, residual) for pair, residual in update.links.items()}
@@ -123,6 +130,11 @@ class LivePage:
             self._map_at = time.monotonic()
             self._map = jax.tree.map(lambda leaf: np.array(leaf, copy=True), session.state.grid), session.tiles.copy()
 
+    def tell(self, status: Status) -> None:
+        """Takes in figures; called by the loop also while no step comes."""
+        with self._lock:
+            self._status = status
+
     def _take_track(self, session: Session) -> None:
         """What happened may have changed the track so far: the frame was decided, or revised."""
         history = session.history
@@ -136,7 +148,7 @@ class LivePage:
 
     def whole(self) -> str:
         """The page as it is now, for a new viewer."""
-        notice = page.notices([("info", "Waiting for the first scan.")])
+        notice = page.notices([("info", self._first)])
         sections = "".join(
             page.section(title, f'<div id="{name}"></div>')
             for name, title in (("beacon-words", "Beacons"), ("event-words", "Events"))
@@ -185,10 +197,10 @@ class LivePage:
             now, status = self._now, self._status
         notices = [("warn", text) for text in status.troubles]
         if now is None:
-            return "words", _json({"notices": page.notices([*notices, ("info", "Waiting for the first scan.")])})
+            return "words", _json({"notices": page.notices([*notices, ("info", self._first)])})
         update = now.update
         if not update.decided and update.status in _HINTS:
-            notices.append(("warn", _HINTS[update.status]))
+            notices.append(("warn", _HINTS[update.status] if self._motion else _UNSEEN))
         if bool(update.estimate.poor) and update.score is not None:
             notices.append(("info", "The scan does not fit the map: it is not drawn."))
         begin = self._start or 0

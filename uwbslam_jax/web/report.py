@@ -111,8 +111,7 @@ def _notices(result: Result, metrics: Mapping[str, Any] | None) -> Iterator[tupl
     elif not _decided(result)[0]:
         yield (
             "warn",
-            "The frame was not decided. Poses, beacons and map are not in a known frame: most often the "
-            "robot did not move or turn enough, or too few ranges were heard.",
+            "The frame was not decided: poses, beacons and map are not in a known frame.",
         )
     elif not result.beacons:
         yield "warn", "No beacon was placed."

@@ -34,8 +34,9 @@ class EmulateOptions:
     """Serve the sensors of a simulated robot in real time, for uwbslam live; it sets off when somebody listens."""
 
     devices: Positional[tuple[str, ...]]
-    """hokuyo, rplidar, dwm1000, dwm1000-powers, linktrack, linktrack3, dwm1001, makerfabs; NAME=URL for another port
-    (tcp://HOST:PORT or serial:///PATH, a link to a pseudo-terminal). All belong to one robot."""
+    """hokuyo, rplidar, rplidar-c1, rplidar-old, dwm1000, dwm1000-powers, linktrack, linktrack3, dwm1001, makerfabs;
+    NAME=URL for another port (tcp://HOST:PORT or serial:///PATH, a link to a pseudo-terminal). All belong to one
+    robot."""
     world: str = "workshop"
     """The scenario, as of uwbslam simulate."""
     seed: int = 0

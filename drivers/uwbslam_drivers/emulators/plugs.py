@@ -7,7 +7,6 @@ import os
 import select
 import socket
 import time
-import tty
 from pathlib import Path
 
 _SEND_TIMEOUT, _POLL = 0.5, 0.02
@@ -96,6 +95,8 @@ class PtyPlug:
         """Is there (again)."""
         if self._link.exists() and not self._link.is_symlink():
             raise FileExistsError(17, "is in the way of an emulated port", str(self._link))
+        import tty  # here, for only POSIX systems have it, and recordings are run without
+
         self._master, slave = os.openpty()
         tty.setraw(slave)
         os.set_blocking(self._master, False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +17,21 @@ STANDARD, EXPRESS = 500, 250
 """Time of a sample [us]: what an A2 answers to GET_SAMPLERATE (LR001)."""
 REACH, SIGMA = 12.0, 0.01
 """Farthest return of an A2, and the standard deviation of a distance [m]."""
+_MODES = {protocol.SCAN: "standard", protocol.EXPRESS: "express", protocol.STOP: "", protocol.RESET: ""}
+"""Mode that a request leads to [request -> name], where it is known."""
+_REPLIES = {
+    protocol.GET_HEALTH: protocol.HEALTH_HEADER + b"\x00\x00\x00",
+    protocol.GET_SAMPLERATE: protocol.RATE_HEADER + STANDARD.to_bytes(2, "little") + EXPRESS.to_bytes(2, "little"),
+    protocol.SCAN: protocol.SCAN_HEADER,
+    protocol.EXPRESS: protocol.EXPRESS_HEADER,
+}
+"""Request -> what an A2 says at once [bytes] (LR001)."""
+_DENSE = b"\xa5\x5a\x54\x00\x00\x40\x85"
+"""Descriptor of dense capsules [bytes] (Slamtec's SDK)."""
+_REPLIES_C1 = _REPLIES | {protocol.EXPRESS: _DENSE}
+"""The same of a C1 [bytes]."""
+_REPLIES_OLD = {request: _REPLIES[request] for request in (protocol.GET_HEALTH, protocol.SCAN)}
+"""The same of an A1 with old firmware [bytes]."""
 
 
 class Samples(NamedTuple):
@@ -27,9 +42,14 @@ class Samples(NamedTuple):
 
 
 class EmulatedRplidar:
-    """An A2-like scanner without accessory board."""
+    """An A2-like scanner without accessory board; its subclasses are other firmwares.
+
+    Attributes:
+      replies: request -> what it says at once. A scanner does not know requests that are missing.
+    """
 
     protocol = "rplidar"
+    replies: Mapping[bytes, bytes] = _REPLIES
 
     def __init__(self, time: DeviceTime):
         self._mode = ""
@@ -75,19 +95,25 @@ class EmulatedRplidar:
         return said
 
     def _reply(self, request: bytes) -> bytes:
-        if request == protocol.GET_HEALTH:
-            return protocol.HEALTH_HEADER + b"\x00\x00\x00"
-        if request == protocol.GET_SAMPLERATE:
-            return protocol.RATE_HEADER + STANDARD.to_bytes(2, "little") + EXPRESS.to_bytes(2, "little")
-        if request == protocol.SCAN:
-            self._mode = "standard"
-            return protocol.SCAN_HEADER
-        if request == protocol.EXPRESS:
-            self._mode, self._begun = "express", False
-            return protocol.EXPRESS_HEADER
-        if request in (protocol.STOP, protocol.RESET):
-            self._mode = ""
-        return b""
+        said = self.replies.get(request, b"")
+        if request in _MODES and (said or not _MODES[request]):
+            self._mode, self._begun = _MODES[request], False
+        return said
+
+
+class EmulatedRplidarC1(EmulatedRplidar):
+    """A C1, S2 or S3: its express scan comes in dense capsules, 40 distances each."""
+
+    replies: Mapping[bytes, bytes] = _REPLIES_C1
+
+    def encode(self, samples: Samples, departure: int) -> bytes:
+        return super().encode(samples, departure) if self._mode == "standard" else b"\xa0\x50" * 42 * bool(self._mode)
+
+
+class EmulatedRplidarOld(EmulatedRplidar):
+    """An A1 with firmware before 1.17: it knows neither sample times nor an express scan."""
+
+    replies: Mapping[bytes, bytes] = _REPLIES_OLD
 
 
 def _distances(scenario: Scenario, times: np.ndarray, rate: float) -> np.ndarray:

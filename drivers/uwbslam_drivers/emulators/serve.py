@@ -19,7 +19,7 @@ from uwbslam_drivers.emulators.radios import (
     EmulatedMakerfabs,
 )
 from uwbslam_drivers.emulators.robot import Departure, DeviceTime
-from uwbslam_drivers.emulators.rplidar import EmulatedRplidar
+from uwbslam_drivers.emulators.rplidar import EmulatedRplidar, EmulatedRplidarC1, EmulatedRplidarOld
 from uwbslam_jax.sim import Scenario, stream
 
 _POLL = 0.02
@@ -55,6 +55,8 @@ class EmulatedDevice(Protocol):
 EMULATORS: Mapping[str, Callable[[DeviceTime], EmulatedDevice]] = {
     "hokuyo": EmulatedHokuyo,
     "rplidar": EmulatedRplidar,
+    "rplidar-c1": EmulatedRplidarC1,
+    "rplidar-old": EmulatedRplidarOld,
     "dwm1000": EmulatedDwm1000,
     "dwm1000-powers": EmulatedDwm1000Powers,
     "linktrack": EmulatedLinkTrack,

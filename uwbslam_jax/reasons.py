@@ -1,0 +1,94 @@
+"""Why measurements are left out: what files and pages call it, of which sensor, and what a user can do about it."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+
+class Sensor(StrEnum):
+    """What a measurement is of; the value is the word for one."""
+
+    SCAN = "scan"
+    RANGE = "range"
+    ODOMETRY = "odometry"
+
+
+class Reason(str):
+    """A reason as it is counted, "sensor: words"; equal to any text that says the same.
+
+    Attributes:
+      sensor: whose measurement is lost.
+      words: why.
+      advice: the likely cause and what helps.
+      of: what is counted where that is not the measurement itself, such as the line that held it; else "".
+    """
+
+    sensor: Sensor
+    words: str
+    advice: str
+    of: str
+
+    def __new__(cls, sensor: Sensor, words: str, advice: str, of: str = "") -> Reason:
+        made = super().__new__(cls, f"{of or sensor}: {words}")
+        made.sensor, made.words, made.advice, made.of = sensor, words, advice, of
+        return made
+
+    def __getnewargs__(self) -> tuple[Sensor, str, str, str]:
+        return self.sensor, self.words, self.advice, self.of
+
+
+_CLOCK = "a clock was set back, a recording is looped, or stamps are of another clock; uwbslam inspect shows them"
+"""Advice for a stamp that goes back [text]."""
+_BYTES = "bytes are damaged or do not fit the type that the recording gives; uwbslam inspect lists the types"
+"""Advice for a message that does not decode [text]."""
+_LINE = "a loose or long cable, another baud, or a second program at the port"
+"""Advice for what a device sent and did not arrive whole [text]."""
+
+
+class ScanLost:
+    """Of scans."""
+
+    STAMP = Reason(Sensor.SCAN, "stamp not after the one before", _CLOCK)
+    NO_BEARINGS = Reason(Sensor.SCAN, "no beams or no bearings", "the LiDAR's driver leaves its fields empty")
+    NO_BEAMS = Reason(Sensor.SCAN, "no beams", "the LiDAR measures nothing, or its driver leaves the readings out")
+    MALFORMED = Reason(Sensor.SCAN, "malformed", _BYTES)
+    OVERTAKEN = Reason(
+        Sensor.SCAN,
+        "overtaken by a newer one",
+        "this computer is too slow; fewer beams (--lidar.max-beams) or a smaller window (--map.size-m) help",
+    )
+    NO_TURN = Reason(Sensor.SCAN, "no new turn", "the motor stands still, or bytes are lost")
+    FEW_SAMPLES = Reason(Sensor.SCAN, "too few samples", _LINE)
+    ANGLES = Reason(Sensor.SCAN, "angles do not fit", _LINE)
+    STAMP_DAMAGED = Reason(Sensor.SCAN, "stamp damaged", _LINE)
+    NOT_INTACT = Reason(Sensor.SCAN, "too little of it intact", _LINE)
+
+
+class RangeLost:
+    """Of ranges."""
+
+    IMPOSSIBLE = Reason(Sensor.RANGE, "not finite, not positive or too long", "another unit, or --uwb.max-range")
+    NOT_POSITIVE = Reason(Sensor.RANGE, "not finite or not positive", "the radio reports failed exchanges as ranges")
+    SELF = Reason(Sensor.RANGE, "a node to itself", "two radios have one id")
+    FROM_SELF = Reason(Sensor.RANGE, "from a node to itself", "two radios have one id, or --robot.id is a beacon's")
+    STAMP = Reason(Sensor.RANGE, "stamp not after the pair's one before", _CLOCK)
+    LATE = Reason(Sensor.RANGE, "arrived too late", "the radio's clock is behind the LiDAR's; uwbslam inspect shows it")
+    NO_SLOT = Reason(Sensor.RANGE, "more beacons than max_beacons", "give a larger --uwb.max-beacons")
+    FRAME_FULL = Reason(Sensor.RANGE, "more than one frame holds", "far more ranges come than scans, or scans are lost")
+    MALFORMED = Reason(Sensor.RANGE, "malformed", _BYTES)
+    LINE_DAMAGED = Reason(Sensor.RANGE, "damaged", _LINE, of="line")
+    LINE_TOO_LONG = Reason(Sensor.RANGE, "too long", _LINE, of="line")
+    WRONG_SUM = Reason(Sensor.RANGE, "wrong sum", _LINE, of="frame")
+
+    @staticmethod
+    def over(most: float) -> Reason:
+        """Beyond the greatest range that is taken [m]."""
+        return Reason(Sensor.RANGE, f"over {most:g} m", "are they in mm or cm? otherwise give a larger --uwb.max-range")
+
+
+class OdometryLost:
+    """Of odometry."""
+
+    NOT_FINITE = Reason(Sensor.ODOMETRY, "not finite", "the wheels' node reports no pose")
+    STAMP = Reason(Sensor.ODOMETRY, "stamp not after the one before", _CLOCK)
+    MALFORMED = Reason(Sensor.ODOMETRY, "malformed", _BYTES)

@@ -1,0 +1,67 @@
+"""What a run has to say for measurements that it lost and beacons that it did not place. Pure: counts in, lines out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from uwbslam_jax.reasons import Reason, Sensor
+from uwbslam_jax.result import RunStatus
+
+MANY = 0.2
+"""Losing a larger share of a sensor is told [0 to 1]: a tenth is a slow computer, a fifth is a fault."""
+FEW = 5
+"""Fewer than so many that are lost are not told, unless all are [measurements]: a device may start within a line."""
+_MOST_REASONS = 2
+"""So many reasons are named, the most frequent first [reasons]: a line is not a table."""
+_PLURAL = {Sensor.SCAN: "scans", Sensor.RANGE: "ranges", Sensor.ODOMETRY: "odometry poses"}
+"""Several measurements of a sensor [sensor -> words]."""
+
+
+def losses(used: Mapping[Sensor, int], dropped: Mapping[str, int], least: int = 1) -> dict[Sensor, str]:
+    """A line for each sensor of which more than a fifth was lost: how much, why, and what helps.
+
+    Args:
+      used: measurements that went into frames.
+      dropped: measurements left out, by reason; what is no `Reason` is of no sensor.
+      least: fewer that are lost are not told, even where they are all.
+    """
+    told = {}
+    for sensor in Sensor:
+        own = {why: n for why, n in dropped.items() if isinstance(why, Reason) and why.sensor is sensor and n > 0}
+        lost, kept = sum(own.values()), used.get(sensor, 0)
+        if lost > MANY * (lost + kept) and lost >= (max(FEW, least) if kept else least):
+            often = sorted(own, key=lambda why: -own[why])
+            share = f"{lost} of {lost + kept}" if kept else f"all {lost}"
+            named = ", ".join(f"{own[why]} x {why.words}" for why in often[:_MOST_REASONS])
+            told[sensor] = f"{share} {_PLURAL[sensor]} were left out ({named}): {often[0].advice}"
+    return told
+
+
+def blank_scans(scans: int, blank: int) -> list[str]:
+    """A line where most of the scans that were used held no return."""
+    if 2 * blank <= scans:
+        return []
+    helps = "is the LiDAR covered, or are its readings in another unit? see --lidar.min-range and --lidar.max-range"
+    return [f"{blank} of {scans} scans hold no return within the limits: {helps}"]
+
+
+def unplaced(status: RunStatus, robot: int, *, ranges: int, seen: bool) -> str:
+    """The line of a run that heard beacons, or should have, and placed none.
+
+    Args:
+      status: of start-up at the end. robot: id of the robot's node.
+      ranges: how many went into frames.
+      seen: whether scans that fitted, or odometry, showed how the robot moved.
+    """
+    if not ranges:
+        return "no range was heard: no beacon is placed; is the radio on, and does --uwb.topic name its ranges?"
+    if not seen:
+        return "no beacon is placed: neither scans nor odometry show how the robot moves"
+    if status is RunStatus.WAITING:
+        return "no beacon is placed: by its scans and odometry the robot has moved less than a metre; drive on"
+    if status is RunStatus.UNDECIDED:
+        return "no beacon is placed: the ranges fit a mirrored place as well; drive on, and turn both ways"
+    return (
+        f"no beacon is placed: too few ranges with the robot's node (--robot.id {robot}), too straight a way, "
+        "or ranges that do not fit the track"
+    )
