@@ -17,15 +17,16 @@ from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any, Literal
 
-import numpy as np
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from uwbslam_jax.errors import LogError
 from uwbslam_jax.files.mcap_container import Channel
+from uwbslam_jax.files.pose_messages import take_odometry, take_truth
 from uwbslam_jax.files.ros_types import STORE, UWB_RANGE
-from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, ScanMessage, TruthMessage
+from uwbslam_jax.files.scan_messages import foxglove_protobuf, take_scan
+from uwbslam_jax.measurements import Message, RangeMessage
 
 Role = Literal["scan", "uwb", "odom", "truth"]
 Decoder = Callable[[bytes, int], list[Message]]
@@ -122,7 +123,7 @@ def _unpacker(channel: Channel, role: Role) -> tuple[Callable[[bytes], Any], set
     if channel.encoding == "json" and plausible(channel, role):
         return (lambda data: json.loads(data, object_hook=lambda d: SimpleNamespace(**d))), None
     if channel.encoding == "protobuf" and role == "scan" and channel.schema == "foxglove.LaserScan":
-        return _foxglove_protobuf, None
+        return foxglove_protobuf, None
     raise LogError(
         f"topic {channel.topic}: schema {channel.schema!r} in encoding {channel.encoding!r} is not supported for "
         f"a {_WORDS[role]}; supported: {SUPPORTED[role]} in cdr, ros1 or json, foxglove.LaserScan also in protobuf"
@@ -208,24 +209,6 @@ def _stamp(message: Any, log_time: int) -> int:
     return int(time.sec) * 1_000_000_000 + int(time.nsec if nanosec is None else nanosec) or log_time
 
 
-def _take_scan(message: Any, log_time: int, options: Options) -> list[Message]:
-    ranges = np.array(message.ranges, dtype=np.float32).reshape(-1)
-    if ranges.size == 0:
-        options.dropped["scan: no beams"] += 1
-        return []
-    if hasattr(message, "start_angle"):  # foxglove: the sweep's two ends, no limits, taken at once
-        angle_min, time_increment, limits = float(message.start_angle), 0.0, (0.0, math.inf)
-        increment = (float(message.end_angle) - angle_min) / max(ranges.size - 1, 1)
-    else:
-        angle_min, increment = float(message.angle_min), float(message.angle_increment)
-        time_increment, limits = float(message.time_increment), (float(message.range_min), float(message.range_max))
-    if not limits[0] < limits[1]:  # drivers that leave both at 0 mean: no limits
-        limits = (0.0, math.inf)
-    if not all(map(math.isfinite, (angle_min, increment, time_increment))) or (increment == 0 and ranges.size > 1):
-        raise ValueError("bearings are not finite or all the same")
-    return [ScanMessage(_stamp(message, log_time), angle_min, increment, time_increment, *limits, ranges)]
-
-
 def _take_ranges(message: Any, log_time: int, options: Options) -> list[Message]:
     stamp = _stamp(message, log_time)
     if hasattr(message, "nodes"):
@@ -247,78 +230,10 @@ def _linktrack_id(frame: Any, node: Any) -> int:
     return int(node.id) if node.id != frame.id or node.role == frame.role else int(node.role) * 256 + int(node.id)
 
 
-def _yaw(q: Any) -> float:
-    return math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
-
-
-def _take_odometry(message: Any, log_time: int, options: Options) -> list[Message]:
-    pose = message.pose.pose
-    x, y, yaw = float(pose.position.x), float(pose.position.y), _yaw(pose.orientation)
-    if not all(map(math.isfinite, (x, y, yaw))):
-        options.dropped["odometry: not finite"] += 1
-        return []
-    return [OdometryMessage(_stamp(message, log_time), x, y, yaw)]
-
-
-def _take_truth(message: Any, log_time: int, options: Options) -> list[Message]:
-    """A pose, or the point of a node that the topic names and `mcap_log` fills in."""
-    del options
-    stamp = _stamp(message, log_time)
-    if hasattr(message, "pose"):
-        p = message.pose.position
-        return [TruthMessage(stamp, None, float(p.x), float(p.y), _yaw(message.pose.orientation))]
-    return [TruthMessage(stamp, None, float(message.point.x), float(message.point.y))]
-
-
 _TAKE: dict[Role, Callable[[Any, int, Options], list[Message]]] = {
-    "scan": _take_scan,
+    "scan": lambda message, log_time, options: take_scan(message, _stamp(message, log_time), options.dropped),
     "uwb": _take_ranges,
-    "odom": _take_odometry,
-    "truth": _take_truth,
+    "odom": lambda message, log_time, options: take_odometry(message, _stamp(message, log_time), options.dropped),
+    "truth": lambda message, log_time, _: take_truth(message, _stamp(message, log_time)),
 }
 """From an unpacked message to its measurements [role -> function]."""
-
-
-def _varint(data: bytes, position: int) -> tuple[int, int]:
-    value = shift = 0
-    while True:
-        byte = data[position]
-        value |= (byte & 0x7F) << shift
-        position, shift = position + 1, shift + 7
-        if byte < 0x80:
-            return value, position
-
-
-def _wire_fields(data: bytes) -> dict[int, list[int | bytes]]:
-    """Fields of a protobuf message by number, undecoded (protobuf.dev/programming-guides/encoding)."""
-    fields: dict[int, list[int | bytes]] = {}
-    position = 0
-    while position < len(data):
-        tag, position = _varint(data, position)
-        if tag & 7 == 0:
-            value, position = _varint(data, position)
-        else:
-            size, position = ({1: 8, 5: 4}[tag & 7], position) if tag & 7 != 2 else _varint(data, position)
-            value, position = data[position : position + size], position + size
-            if position > len(data):
-                raise ValueError("cut off")
-        fields.setdefault(tag >> 3, []).append(value)
-    return fields
-
-
-def _doubles(fields: dict[int, list[int | bytes]], number: int) -> np.ndarray:
-    parts = fields.get(number, [])
-    return np.frombuffer(b"".join(part for part in parts if isinstance(part, bytes)), "<f8")
-
-
-def _foxglove_protobuf(data: bytes) -> SimpleNamespace:
-    """A foxglove.LaserScan: 1 timestamp, 4 start and 5 end angle, 6 ranges (double, packed or not)."""
-    fields = _wire_fields(data)
-    (time,) = fields.get(1, [b""])[-1:]
-    time_fields = _wire_fields(time) if isinstance(time, bytes) else {}
-    sec, nsec = (time_fields.get(number, [0])[-1] for number in (1, 2))
-    angles = [[0.0, *_doubles(fields, number)][-1] for number in (4, 5)]
-    ranges = _doubles(fields, 6)
-    return SimpleNamespace(
-        timestamp=SimpleNamespace(sec=sec, nsec=nsec), start_angle=angles[0], end_angle=angles[1], ranges=ranges
-    )
