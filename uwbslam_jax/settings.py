@@ -168,6 +168,8 @@ class LidarSettings:
     """Longer readings are no return [m]; the sensor's own limit holds where it is narrower."""
     max_beams: int = 1081
     """A scan of more beams is thinned evenly to at most this many."""
+    frame: str = ""
+    """frame_id of the scanner to use where the topic carries several; "" for the one with most scans."""
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 
 from uwbslam_jax.errors import LogError
 from uwbslam_jax.files.bag import Bag, Source
-from uwbslam_jax.files.mcap_log import choose_topics
+from uwbslam_jax.files.mcap_log import choose_topics, look_first
+from uwbslam_jax.files.scan_messages import ScanReader
 from uwbslam_jax.files.schemas import Decoder, Options, Role
 from uwbslam_jax.measurements import Message, RangeMessage, ScanMessage
 
@@ -98,6 +99,7 @@ def inspect_log(
     scan_topic: str | None = "/scan",
     uwb_topic: str | None = "/uwb/ranges",
     odom_topic: str | None = "/odom",
+    scan_frame: str = "",
     robot_id: int = 0,
     max_range: float = 200.0,
 ) -> LogSummary:
@@ -106,7 +108,7 @@ def inspect_log(
     Raises:
       LogError: the file cannot be read at all. Missing or ambiguous topics are `problems` of the summary.
     """
-    recording, options = Bag(source), Options(robot_id, max_range)
+    recording, options = Bag(source), Options(robot_id, max_range, ScanReader(scan_frame))
     decoders: dict[int, Decoder] = {}
     roles: dict[int, Role] = {}
     problems: list[str] = []
@@ -119,6 +121,7 @@ def inspect_log(
                 problems.append(f"no {role} topic")
         except LogError as error:
             problems.append(str(error))
+    look_first(recording, decoders, roles, options)
     topic_of = {channel.id: channel.topic for channel in recording.channels.values()}
     clocks = {topic: _Clock() for topic in topic_of.values()}
     heard = _Heard()
@@ -139,7 +142,7 @@ def inspect_log(
         ground_truth="truth" in roles.values(),
         beams=heard.beams,
         dropped=options.dropped,
-        problems=problems,
+        problems=[*problems, *options.scans.told.values()],
         truncated=recording.truncated,
     )
 

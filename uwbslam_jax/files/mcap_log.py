@@ -10,6 +10,7 @@ import struct
 from collections import Counter
 from collections.abc import Iterator
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
 
@@ -18,6 +19,7 @@ from uwbslam_jax.evaluation import Truth
 from uwbslam_jax.files.bag import Bag, Source
 from uwbslam_jax.files.mcap_container import Channel, RecordWriter
 from uwbslam_jax.files.ros_types import definition, encode
+from uwbslam_jax.files.scan_messages import FIRST_LOOK, ScanReader
 from uwbslam_jax.files.schemas import Decoder, Options, Role, make_decoder, plausible
 from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, ScanMessage, TruthMessage
 
@@ -33,7 +35,7 @@ class LogReader:
     Attributes:
       name: what messages call it.
       topics: topic -> role ("scan", "uwb", "odom", "truth") of the topics used.
-      warnings: what a user should know before the run, one line each.
+      warnings: what a user should know, one line each; some show only while iterating.
       dropped: messages left out so far, by reason; of the current iteration.
       truncated: where the recording breaks, None where it does not; a corrupt chunk shows only while iterating.
       message_count: messages on the topics used, whole and not yet decoded; for a progress bar.
@@ -47,6 +49,7 @@ class LogReader:
         scan_topic: str | None = "/scan",
         uwb_topic: str | None = "/uwb/ranges",
         odom_topic: str | None = "/odom",
+        scan_frame: str = "",
         robot_id: int = 0,
         max_range: float = 200.0,
     ):
@@ -55,6 +58,7 @@ class LogReader:
         Args:
           source: an MCAP file, a ROS 2 bag folder, or several that belong together.
           scan_topic, uwb_topic, odom_topic: where to look first; None leaves that sensor out.
+          scan_frame: frame_id of the scanner to use where a topic carries several; "" for the one with most scans.
           robot_id: id of the robot's node, for range messages that name only the other one.
           max_range: longer ranges are dropped and counted [m].
 
@@ -63,7 +67,7 @@ class LogReader:
             topic holds something else.
         """
         self._recording = Bag(source)
-        self._options = Options(robot_id, max_range)
+        self._options = Options(robot_id, max_range, ScanReader(scan_frame))
         self.name = self._recording.name
         wanted: dict[Role, str | None] = {"scan": scan_topic, "uwb": uwb_topic, "odom": odom_topic}
         try:
@@ -74,14 +78,19 @@ class LogReader:
         except LogError as error:
             broken = f"; {self._recording.truncated}" if self._recording.truncated else ""
             raise LogError(f"{self.name}: {' '.join(str(error).split())}{broken}") from None
+        look_first(self._recording, self._decoders, self._roles, self._options)
         channels = self._recording.channels
         self.topics: dict[str, Role] = {channels[number].topic: role for number, role in self._roles.items()}
-        self.warnings: list[str] = []
+        self._warnings: list[str] = []
         if uwb_topic is not None and "uwb" not in self._roles.values():
-            self.warnings.append(f"no UWB topic: {'LiDAR' if 'scan' in self._roles.values() else 'odometry'} only")
+            self._warnings.append(f"no UWB topic: {'LiDAR' if 'scan' in self._roles.values() else 'odometry'} only")
         self.duration = (self._recording.end - self._recording.start) * 1e-9
         counts = self._recording.counts
         self.message_count = sum(counts[number] for number in self._roles)
+
+    @property
+    def warnings(self) -> list[str]:
+        return [*self._warnings, *self._options.scans.told.values()]
 
     @property
     def dropped(self) -> Counter[str]:
@@ -129,6 +138,15 @@ def choose_topics(
         if channel.id not in decoders and (decoder := _truth_decoder(channel, options)) is not None:
             decoders[channel.id], roles[channel.id] = decoder, "truth"
     return decoders, roles
+
+
+def look_first(recording: Bag, decoders: dict[int, Decoder], roles: dict[int, Role], options: Options) -> None:
+    """Reads the first scans, which tell how their driver means the rest."""
+    scans = {number for number, role in roles.items() if role == "scan" and recording.counts[number]}
+    for log_time, number, data in islice(recording.records(scans) if scans else (), FIRST_LOOK):
+        decoders[number](data, log_time)
+    options.scans.settle()
+    options.dropped.clear()
 
 
 def _discover(recording: Bag, role: Role, options: Options) -> dict[int, Decoder]:

@@ -25,7 +25,7 @@ from uwbslam_jax.errors import LogError
 from uwbslam_jax.files.mcap_container import Channel
 from uwbslam_jax.files.pose_messages import take_odometry, take_truth
 from uwbslam_jax.files.ros_types import STORE, UWB_RANGE
-from uwbslam_jax.files.scan_messages import foxglove_protobuf, take_scan
+from uwbslam_jax.files.scan_messages import ScanReader, foxglove_protobuf
 from uwbslam_jax.measurements import Message, RangeMessage
 
 Role = Literal["scan", "uwb", "odom", "truth"]
@@ -68,11 +68,13 @@ class Options:
     Attributes:
       robot_id: id of the robot's node, for messages that name only the other one.
       max_range: longer ranges are dropped [m].
+      scans: reads the scans.
       dropped: what was left out, by reason.
     """
 
     robot_id: int = 0
     max_range: float = 200.0
+    scans: ScanReader = field(default_factory=ScanReader)
     dropped: Counter[str] = field(default_factory=Counter)
 
 
@@ -231,7 +233,7 @@ def _linktrack_id(frame: Any, node: Any) -> int:
 
 
 _TAKE: dict[Role, Callable[[Any, int, Options], list[Message]]] = {
-    "scan": lambda message, log_time, options: take_scan(message, _stamp(message, log_time), options.dropped),
+    "scan": lambda message, log_time, options: options.scans.take(message, _stamp(message, log_time), options.dropped),
     "uwb": _take_ranges,
     "odom": lambda message, log_time, options: take_odometry(message, _stamp(message, log_time), options.dropped),
     "truth": lambda message, log_time, _: take_truth(message, _stamp(message, log_time)),

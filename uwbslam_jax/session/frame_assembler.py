@@ -43,6 +43,8 @@ _ODOMETRY_LAGS_S = 15.0
 """Ranges wait this long for odometry that has come before."""
 _ODOMETRY_HOLD_S = 0.3
 """The last odometry is extrapolated at most this far."""
+_ROUNDING = 1e-6
+"""A reading so close to the sensor's limit is at it [ratio]: single precision."""
 
 
 class FrameAssembler:
@@ -242,9 +244,10 @@ def pad_scan(scan: ScanMessage | None, settings: Settings) -> Scan:
         return Scan(ranges, valid, np.float32(0), np.float32(1e-3), np.float32(0))
     stride = -(-scan.ranges.size // beams)
     taken = np.asarray(scan.ranges[::stride], np.float32)
-    low, high = max(scan.range_min, settings.lidar.min_range), min(scan.range_max, settings.lidar.max_range)
+    low, high = max(scan.range_min, settings.lidar.min_range), settings.lidar.max_range
     with np.errstate(invalid="ignore"):
         ok = np.isfinite(taken) & (taken >= low) & (taken <= high) & (taken > 0)
+        ok &= taken < scan.range_max * (1.0 - _ROUNDING)  # many tell no return as their limit itself
     ranges[: taken.size], valid[: taken.size] = np.where(ok, taken, 0.0), ok
     return Scan(
         ranges,
