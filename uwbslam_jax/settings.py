@@ -122,7 +122,8 @@ class HostParams:
 
 @dataclass(frozen=True)
 class RobotSettings:
-    """The robot: its UWB node id and where its sensors sit in the robot's frame."""
+    """The robot: its UWB node id and where its sensors sit in the robot's frame; where a place is left at its default,
+    the transforms of a recording tell it, if it has some."""
 
     id: int = 0
     """Node id of the robot's UWB radio."""
@@ -130,6 +131,8 @@ class RobotSettings:
     """UWB antenna x, y, z on the robot [m]."""
     lidar: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """LiDAR x, y [m] and yaw [rad] on the robot."""
+    lidar_flip: bool = False
+    """Whether the LiDAR is mounted upside down: its bearings then count clockwise, seen from above."""
 
 
 @dataclass(frozen=True)

@@ -18,15 +18,19 @@ from uwbslam_jax.errors import LogError as LogError
 from uwbslam_jax.evaluation import Truth
 from uwbslam_jax.files.bag import Bag, Source
 from uwbslam_jax.files.mcap_container import Channel, RecordWriter
+from uwbslam_jax.files.mounting import Mounting, read_mounting
+from uwbslam_jax.files.pose_messages import odometry_parts
 from uwbslam_jax.files.ros_types import definition, encode
 from uwbslam_jax.files.scan_messages import FIRST_LOOK, ScanReader
-from uwbslam_jax.files.schemas import Decoder, Options, Role, make_decoder, plausible
+from uwbslam_jax.files.schemas import Decoder, Options, Role, make_decoder, plausible, unpacker
 from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, ScanMessage, TruthMessage
 
 TRUTH_ROBOT, TRUTH_BEACON = "/ground_truth/robot", "/ground_truth/beacon/"
 """Topics of the ground truth, of a beacon without its id [topic]: none is taken for a sensor's."""
 _KEYS: dict[Role, str] = {"scan": "lidar.topic", "uwb": "uwb.topic", "odom": "odom.topic"}
 """The setting that chooses a role's topic [role -> key]: where several topics fit, the error names it."""
+_FIRST_TRANSFORMS = 500
+"""Transforms from odom to the robot are among so many messages, if there are any [messages]."""
 
 
 class LogReader:
@@ -90,7 +94,7 @@ class LogReader:
 
     @property
     def warnings(self) -> list[str]:
-        return [*self._warnings, *self._options.scans.told.values()]
+        return [*self._warnings, *self._options.scans.told.values(), *self._options.told.values()]
 
     @property
     def dropped(self) -> Counter[str]:
@@ -99,6 +103,11 @@ class LogReader:
     @property
     def truncated(self) -> str | None:
         return self._recording.truncated
+
+    @cached_property
+    def mounting(self) -> Mounting:
+        """Where the sensors sit, as far as the recording's transforms tell."""
+        return read_mounting(self._recording, self._roles, self._options.scans.frame)
 
     @cached_property
     def truth(self) -> Truth | None:
@@ -160,10 +169,24 @@ def _discover(recording: Bag, role: Role, options: Options) -> dict[int, Decoder
                 continue  # the name fits, the content does not: not a candidate
     spoken = {number: decoder for number, decoder in found.items() if recording.counts[number]}
     found = spoken or found  # a topic without a message is no rival to one with
+    if not found and role == "odom":
+        return _odometry_in_transforms(recording, options)
     topics = sorted({recording.channels[number].topic for number in found})
     if len(topics) > 1:
         raise LogError(f"several {role} topics: {', '.join(topics)}; choose with --{_KEYS[role]} TOPIC")
     return found
+
+
+def _odometry_in_transforms(recording: Bag, options: Options) -> dict[int, Decoder]:
+    """The channels of transforms that lead from odom to the robot; empty where none does."""
+    channels = [channel for channel in recording.channels.values() if plausible(channel, "tf")]
+    moving = [channel for channel in channels if recording.counts[channel.id] and not channel.topic.endswith("_static")]
+    unpack = {channel.id: unpacker(channel, "tf") for channel in moving}
+    found: set[int] = set()
+    for _, number, data in islice(recording.records(set(unpack)) if unpack else (), _FIRST_TRANSFORMS):
+        message = unpack[number](data)
+        found |= {number} if message is not None and odometry_parts(message) else set()
+    return {channel.id: make_decoder(channel, "odom", options) for channel in moving if channel.id in found}
 
 
 def _truth_decoder(channel: Channel, options: Options) -> Decoder | None:

@@ -23,12 +23,12 @@ from rosbags.typesys.store import Typestore
 
 from uwbslam_jax.errors import LogError
 from uwbslam_jax.files.mcap_container import Channel
-from uwbslam_jax.files.pose_messages import take_odometry, take_truth
+from uwbslam_jax.files.pose_messages import odometry_parts, take_odometry, take_truth
 from uwbslam_jax.files.ros_types import STORE, UWB_RANGE
 from uwbslam_jax.files.scan_messages import ScanReader, foxglove_protobuf
 from uwbslam_jax.measurements import Message, RangeMessage
 
-Role = Literal["scan", "uwb", "odom", "truth"]
+Role = Literal["scan", "uwb", "odom", "truth", "tf"]
 Decoder = Callable[[bytes, int], list[Message]]
 
 _NAMES: dict[Role, str] = {
@@ -36,16 +36,24 @@ _NAMES: dict[Role, str] = {
     "uwb": r"UwbRange|LinktrackNodeframe[23]|.*RangeStamped",
     "odom": r"Odometry",
     "truth": r"PoseStamped|PointStamped",
+    "tf": r"(?i:tfMessage)",
 }
 """What a type is called [role -> regex]; the package does not matter, since vendors have their own."""
 SUPPORTED: dict[Role, str] = {
     "scan": "sensor_msgs/LaserScan, foxglove.LaserScan",
     "uwb": "UwbRange, LinktrackNodeframe2, LinktrackNodeframe3, RangeStamped",
-    "odom": "nav_msgs/Odometry",
+    "odom": "nav_msgs/Odometry, tf2_msgs/TFMessage",
     "truth": "geometry_msgs/PoseStamped, geometry_msgs/PointStamped",
+    "tf": "tf2_msgs/TFMessage, tf/tfMessage",
 }
 """Types that are read [role -> text], for an error about another one."""
-_WORDS: dict[Role, str] = {"scan": "scan", "uwb": "range", "odom": "odometry", "truth": "ground truth"}
+_WORDS: dict[Role, str] = {
+    "scan": "scan",
+    "uwb": "range",
+    "odom": "odometry",
+    "truth": "ground truth",
+    "tf": "transforms",
+}
 """What messages call a role [role -> text]."""
 _FIELDS: dict[Role, dict[str, set[str]]] = {
     "scan": {
@@ -53,8 +61,9 @@ _FIELDS: dict[Role, dict[str, set[str]]] = {
         "foxglove": {"start_angle", "end_angle", "ranges"},
     },
     "uwb": {"range": {"source", "target", "range"}, "stamped": {"to_id", "range"}, "linktrack": {"id", "nodes"}},
-    "odom": {"odom": {"pose", "child_frame_id"}},
+    "odom": {"odom": {"pose", "child_frame_id"}, "tf": {"transforms"}},
     "truth": {"pose": {"header", "pose"}, "point": {"header", "point"}},
+    "tf": {"tf": {"transforms"}},
 }
 """Layouts that are read, by the fields that they need [role -> layout -> fields]."""
 _MALFORMED = (SerdeError, struct.error, AttributeError, TypeError, ValueError, LookupError, ArithmeticError)
@@ -70,12 +79,14 @@ class Options:
       max_range: longer ranges are dropped [m].
       scans: reads the scans.
       dropped: what was left out, by reason.
+      told: what a user should know of the poses, one line each, by what it is about.
     """
 
     robot_id: int = 0
     max_range: float = 200.0
     scans: ScanReader = field(default_factory=ScanReader)
     dropped: Counter[str] = field(default_factory=Counter)
+    told: dict[str, str] = field(default_factory=dict)
 
 
 def plausible(channel: Channel, role: Role) -> bool:
@@ -109,6 +120,22 @@ def make_decoder(channel: Channel, role: Role, options: Options) -> Decoder:
             return []
 
     return decode
+
+
+def unpacker(channel: Channel, role: Role) -> Callable[[bytes], Any]:
+    """From the bytes of a message of this channel to an object with its fields, None where it cannot be read."""
+    try:
+        unpack = _unpacker(channel, role)[0]
+    except LogError:
+        return lambda _: None
+
+    def read(data: bytes) -> Any:
+        try:
+            return unpack(data)
+        except _MALFORMED:
+            return None
+
+    return read
 
 
 def _base_name(schema: str) -> str:
@@ -235,7 +262,11 @@ def _linktrack_id(frame: Any, node: Any) -> int:
 _TAKE: dict[Role, Callable[[Any, int, Options], list[Message]]] = {
     "scan": lambda message, log_time, options: options.scans.take(message, _stamp(message, log_time), options.dropped),
     "uwb": _take_ranges,
-    "odom": lambda message, log_time, options: take_odometry(message, _stamp(message, log_time), options.dropped),
+    "odom": lambda message, log_time, options: [
+        found
+        for part in odometry_parts(message)
+        for found in take_odometry(part, _stamp(part, log_time), options.dropped, options.told)
+    ],
     "truth": lambda message, log_time, _: take_truth(message, _stamp(message, log_time)),
 }
 """From an unpacked message to its measurements [role -> function]."""

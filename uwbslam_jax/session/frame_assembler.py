@@ -237,7 +237,8 @@ def _pose_at(track: list[OdometryMessage], stamp: int) -> tuple[float, float, fl
 
 
 def pad_scan(scan: ScanMessage | None, settings: Settings) -> Scan:
-    """A scan in the slots of a frame; more beams than slots are thinned evenly, no return is 0 and not valid."""
+    """A scan in the slots of a frame; more beams than slots are thinned evenly, no return is 0 and not valid. Bearings
+    of a LiDAR upside down are turned over."""
     beams = settings.lidar.max_beams
     ranges, valid = np.zeros(beams, np.float32), np.zeros(beams, bool)
     if scan is None:
@@ -249,11 +250,12 @@ def pad_scan(scan: ScanMessage | None, settings: Settings) -> Scan:
         ok = np.isfinite(taken) & (taken >= low) & (taken <= high) & (taken > 0)
         ok &= taken < scan.range_max * (1.0 - _ROUNDING)  # many tell no return as their limit itself
     ranges[: taken.size], valid[: taken.size] = np.where(ok, taken, 0.0), ok
+    turn = -1.0 if settings.robot.lidar_flip else 1.0
     return Scan(
         ranges,
         valid,
-        np.float32(scan.angle_min),
-        np.float32(scan.angle_increment * stride),
+        np.float32(turn * scan.angle_min),
+        np.float32(turn * scan.angle_increment * stride),
         np.float32(scan.time_increment * stride),
     )
 
