@@ -26,6 +26,7 @@ from uwbslam_jax.measurements import (
     TruthMessage,
 )
 from uwbslam_jax.numerics import between, wrapped
+from uwbslam_jax.session.odometry_track import OdometryTrack
 from uwbslam_jax.settings import Settings
 
 _SCANLESS_S = 1.0
@@ -54,6 +55,7 @@ class FrameAssembler:
       slots: node id -> slot, the robot 0; filled as ids are heard.
       dropped: what was not used, by reason.
       warnings: one line each; that there are more beacons than slots is told once.
+      wheels: the odometry's poses so far, as one track.
       odometry_used: whether any frame carried an increment.
     """
 
@@ -61,6 +63,7 @@ class FrameAssembler:
         self.slots: dict[int, int] = {settings.robot.id: 0}
         self.dropped: Counter[str] = Counter()
         self.warnings: list[str] = []
+        self.wheels = OdometryTrack()
         self.odometry_used = False
         self._settings = settings
         self._max_ranges = max_ranges
@@ -147,6 +150,9 @@ class FrameAssembler:
         if self._odometry and message.stamp <= self._odometry[-1].stamp:
             self.dropped["odometry: stamp not after the one before"] += 1
             return []
+        message, joined = self.wheels.join(message)
+        if not joined:
+            self._odometry.clear()
         self._odometry.append(message)
         return self._by_odometry(message.stamp)  # the newest waits for the ranges of its own time
 
