@@ -111,8 +111,8 @@ class OdometryTrack:
             ]
         at = (self._first_jump - self._start) / 1e9
         jumps = (
-            f"odometry jumps ({self.jumps} times, first after {at:.1f} s): the base was restarted or something corrects "
-            f"its pose; it goes on from a new origin ({leave})"
+            f"odometry jumps ({self.jumps} times, first after {at:.1f} s): the base was restarted or something "
+            f"corrects its pose; it goes on from a new origin ({leave})"
         )
         return [jumps] if self.jumps else []
 
