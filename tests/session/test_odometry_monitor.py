@@ -29,7 +29,7 @@ def show(monitor: OdometryMonitor, wheels: list[np.ndarray], dt: float = 1.0) ->
         ((1.0, 1.0, -1.0), "--robot.lidar-flip"),
         ((-1.0, -1.0, 1.0), "--robot.lidar 0 0 "),
         ((2.0, 2.0, 1.0), "2 times"),
-        ((1.0, 1.0, 0.0), "its turns"),
+        ((1.0, 1.0, 0.0), "heading never changes"),
         ((0.01, 0.01, 1.0), "units"),
     ],
 )

@@ -101,8 +101,11 @@ def _cause(pairs: np.ndarray) -> str:
             "it turns the other way: the LiDAR is upside down (--robot.lidar-flip), or the base's driver has the sign "
             "of yaw wrong (--no-odom)"
         )
+    if np.abs(wheels[:, 2]).max() < 0.01 and turn > _MOVED[1] ** 2:
+        return "its heading never changes while the robot turns; see the base's driver (--no-odom)"
     angle = math.atan2(across, along)
-    if abs(math.hypot(along, across) - 1.0) < _LIKE and abs(angle) > _LIKE:
+    turns_alike = turn < _MOVED[1] ** 2 or abs(turning - 1.0) < _LIKE
+    if turns_alike and abs(math.hypot(along, across) - 1.0) < _LIKE and abs(angle) > _LIKE:
         return (
             f"it drives another way: the LiDAR is turned on the robot (--robot.lidar 0 0 {angle:.2f}), or the base's "
             "driver has a sign wrong (--no-odom)"

@@ -17,6 +17,7 @@ _USUAL, _MOST = (3.0, 6.0), (15.0, 30.0)
 """Speed that any robot may reach between two messages, and that none has; in between twice the fastest so far holds
 [m/s, rad/s]."""
 _TURN = 2 * math.pi
+"""A whole turn [rad]."""
 _NEAR_ORIGIN = 0.02
 """A pose so close to zero is where a track begins [m, rad]."""
 _LEAP, _LEAP_LEAST = 3.0, 0.05
