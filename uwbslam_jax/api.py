@@ -19,7 +19,7 @@ from uwbslam_jax import evaluation, result as data
 from uwbslam_jax.errors import LogError, UsageError
 from uwbslam_jax.estimator import CompileClock
 from uwbslam_jax.evaluation import Truth
-from uwbslam_jax.files import LogReader, LogSummary, inspect_log, read_run, settings_file, write_result
+from uwbslam_jax.files import LogReader, LogSummary, inspect_log, mounting, read_run, settings_file, write_result
 from uwbslam_jax.measurements import Message, ScanMessage, TruthMessage
 from uwbslam_jax.result import MapImage, RunStatus
 from uwbslam_jax.session import PEEK_SCANS, Facts, Runner, Saved, Update, fit_beams, saved_state
@@ -106,6 +106,7 @@ def read(path: Paths, settings: Settings | None = None) -> LogReader:
         scan_topic=s.lidar.topic,
         uwb_topic=None if s.filter.lidar_only else s.uwb.topic,
         odom_topic=s.odom.topic if s.odom.use else None,
+        scan_frame=s.lidar.frame,
         robot_id=s.robot.id,
         max_range=s.uwb.max_range,
     )
@@ -115,7 +116,9 @@ def inspect(path: Paths, settings: Settings | None = None) -> LogSummary:
     """Tells what a recording holds: topics, rates, gaps, nodes heard, what is missing; `print` it. Raises LogError."""
     s = settings or Settings()
     topics = {"scan_topic": s.lidar.topic, "uwb_topic": s.uwb.topic, "odom_topic": s.odom.topic}
-    return inspect_log(path, **topics, robot_id=s.robot.id, max_range=s.uwb.max_range)
+    found = inspect_log(path, **topics, scan_frame=s.lidar.frame, robot_id=s.robot.id, max_range=s.uwb.max_range)
+    found.problems.extend(mounting.contradictions(mounting.mounted(s, found.mounting), found.mounting))
+    return found
 
 
 def run(
@@ -159,7 +162,8 @@ def run(
         runner.finish()
         facts = Facts(compile_s=clock.seconds)
     if reader is not None:
-        facts.warnings, facts.dropped, facts.truncated = list(reader.warnings), reader.dropped, reader.truncated
+        facts.warnings = [*reader.warnings, *mounting.contradictions(settings, reader.mounting)]
+        facts.dropped, facts.truncated = reader.dropped, reader.truncated
     facts.wall_s = time.perf_counter() - begin
     found = finished(runner, facts)
     if reader is not None and not len(found.stamps) and not found.beacons:
@@ -368,14 +372,16 @@ def _are_messages(source: object) -> TypeGuard[Sequence[Message]]:
 
 
 def _opened(source: Source, settings: Settings | None) -> tuple[LogReader | Iterable[Message], Settings]:
-    """Messages that can be iterated over again, and the settings for them."""
+    """Messages that can be iterated over again, and the settings for them, with the mounting that a recording tells."""
     if settings is None:
         settings = source.settings if isinstance(source, Simulation) else Settings()
     settings_file.check(settings)
-    if isinstance(source, LogReader | Simulation) or _are_messages(source):
+    if isinstance(source, str | Path | Sequence) and not _are_messages(source):
+        source = read(cast(Paths, source), settings)
+    if isinstance(source, LogReader):
+        return source, mounting.mounted(settings, source.mounting)
+    if isinstance(source, Simulation) or _are_messages(source):
         return source, settings
-    if isinstance(source, str | Path | Sequence):
-        return read(cast(Paths, source), settings), settings
     return list(source), settings
 
 

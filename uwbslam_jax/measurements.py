@@ -42,7 +42,7 @@ class ScanMessage:
       stamp: time of the first beam [ns].
       angle_min, angle_increment: bearing of beam i is angle_min + i * angle_increment [rad], counter-clockwise.
       time_increment: time between two beams [s]; 0 where the whole sweep is taken at once.
-      range_min, range_max: limits of the sensor [m]; a reading outside, zero, inf or NaN is no return.
+      range_min, range_max: limits of the sensor [m]; a reading outside, at range_max, zero, inf or NaN is no return.
       ranges: (beams,) float32 [m].
     """
 

@@ -52,6 +52,8 @@ class ScanLost:
     NO_BEARINGS = Reason(Sensor.SCAN, "no beams or no bearings", "the LiDAR's driver leaves its fields empty")
     NO_BEAMS = Reason(Sensor.SCAN, "no beams", "the LiDAR measures nothing, or its driver leaves the readings out")
     MALFORMED = Reason(Sensor.SCAN, "malformed", _BYTES)
+    OTHER_SCANNER = Reason(Sensor.SCAN, "of another scanner", "one topic holds several scanners; one of them is used")
+    IMPOSSIBLE = Reason(Sensor.SCAN, "impossible bearings", "the LiDAR's driver fills in angles that no scanner has")
     OVERTAKEN = Reason(
         Sensor.SCAN,
         "overtaken by a newer one",
@@ -90,5 +92,8 @@ class OdometryLost:
     """Of odometry."""
 
     NOT_FINITE = Reason(Sensor.ODOMETRY, "not finite", "the wheels' node reports no pose")
+    NO_ROTATION = Reason(
+        Sensor.ODOMETRY, "orientation is no rotation", "the wheels' node leaves the quaternion at zero; mend it there"
+    )
     STAMP = Reason(Sensor.ODOMETRY, "stamp not after the one before", _CLOCK)
     MALFORMED = Reason(Sensor.ODOMETRY, "malformed", _BYTES)

@@ -122,7 +122,8 @@ class HostParams:
 
 @dataclass(frozen=True)
 class RobotSettings:
-    """The robot: its UWB node id and where its sensors sit in the robot's frame."""
+    """The robot: its UWB node id and where its sensors sit in the robot's frame; where a place is left at its default,
+    the transforms of a recording tell it, if it has some."""
 
     id: int = 0
     """Node id of the robot's UWB radio."""
@@ -130,6 +131,8 @@ class RobotSettings:
     """UWB antenna x, y, z on the robot [m]."""
     lidar: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """LiDAR x, y [m] and yaw [rad] on the robot."""
+    lidar_flip: bool = False
+    """Whether the LiDAR is mounted upside down: its bearings then count clockwise, seen from above."""
 
 
 @dataclass(frozen=True)
@@ -168,6 +171,8 @@ class LidarSettings:
     """Longer readings are no return [m]; the sensor's own limit holds where it is narrower."""
     max_beams: int = 1081
     """A scan of more beams is thinned evenly to at most this many."""
+    frame: str = ""
+    """frame_id of the scanner to use where the topic carries several; "" for the one with most scans."""
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,11 @@
 """Recordings in, results out: all that is on disk."""
 
-from uwbslam_jax.files import result_log as result_log, ros_types as ros_types, settings_file as settings_file
+from uwbslam_jax.files import (
+    mounting as mounting,
+    result_log as result_log,
+    ros_types as ros_types,
+    settings_file as settings_file,
+)
 from uwbslam_jax.files.log_summary import LogSummary as LogSummary, inspect_log as inspect_log
 from uwbslam_jax.files.mcap_log import LogReader as LogReader, LogWriter as LogWriter
 from uwbslam_jax.files.ros_types import recorded as recorded

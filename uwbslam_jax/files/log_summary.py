@@ -8,7 +8,9 @@ from dataclasses import dataclass, field
 
 from uwbslam_jax.errors import LogError
 from uwbslam_jax.files.bag import Bag, Source
-from uwbslam_jax.files.mcap_log import choose_topics
+from uwbslam_jax.files.mcap_log import choose_topics, look_first
+from uwbslam_jax.files.mounting import Mounting, read_mounting
+from uwbslam_jax.files.scan_messages import ScanReader
 from uwbslam_jax.files.schemas import Decoder, Options, Role
 from uwbslam_jax.measurements import Message, RangeMessage, ScanMessage
 
@@ -47,6 +49,7 @@ class LogSummary:
       odometry, ground_truth: whether there is any.
       beams: most beams of a scan.
       dropped: messages left out, by reason.
+      mounting: where the sensors sit, as far as the recording tells.
       problems: what keeps the recording from being used, or is worth knowing; one line each.
       truncated: where it breaks, None where it does not.
     """
@@ -61,6 +64,7 @@ class LogSummary:
     ground_truth: bool
     beams: int
     dropped: Counter[str]
+    mounting: Mounting
     problems: list[str]
     truncated: str | None
 
@@ -86,6 +90,7 @@ class LogSummary:
             lines.append(f"powers: {'reported' if self.powers else 'not reported: NLOS by residuals only'}")
         lines.append(f"odometry: {'yes' if self.odometry else 'no'}")
         lines.append(f"ground truth: {'yes' if self.ground_truth else 'no'}")
+        lines += [f"mounting: {self.mounting}"] if str(self.mounting) else []
         lines += [f"dropped: {count} x {reason}" for reason, count in sorted(self.dropped.items())]
         lines += [f"problem: {problem}" for problem in self.problems]
         lines += [f"truncated: {self.truncated}"] if self.truncated else []
@@ -98,6 +103,7 @@ def inspect_log(
     scan_topic: str | None = "/scan",
     uwb_topic: str | None = "/uwb/ranges",
     odom_topic: str | None = "/odom",
+    scan_frame: str = "",
     robot_id: int = 0,
     max_range: float = 200.0,
 ) -> LogSummary:
@@ -106,7 +112,7 @@ def inspect_log(
     Raises:
       LogError: the file cannot be read at all. Missing or ambiguous topics are `problems` of the summary.
     """
-    recording, options = Bag(source), Options(robot_id, max_range)
+    recording, options = Bag(source), Options(robot_id, max_range, ScanReader(scan_frame))
     decoders: dict[int, Decoder] = {}
     roles: dict[int, Role] = {}
     problems: list[str] = []
@@ -119,6 +125,7 @@ def inspect_log(
                 problems.append(f"no {role} topic")
         except LogError as error:
             problems.append(str(error))
+    look_first(recording, decoders, roles, options)
     topic_of = {channel.id: channel.topic for channel in recording.channels.values()}
     clocks = {topic: _Clock() for topic in topic_of.values()}
     heard = _Heard()
@@ -139,7 +146,8 @@ def inspect_log(
         ground_truth="truth" in roles.values(),
         beams=heard.beams,
         dropped=options.dropped,
-        problems=problems,
+        problems=[*problems, *options.scans.told.values(), *options.told.values()],
+        mounting=read_mounting(recording, roles, options.scans.frame),
         truncated=recording.truncated,
     )
 

@@ -10,6 +10,7 @@ import struct
 from collections import Counter
 from collections.abc import Iterator
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
 
@@ -17,14 +18,19 @@ from uwbslam_jax.errors import LogError as LogError
 from uwbslam_jax.evaluation import Truth
 from uwbslam_jax.files.bag import Bag, Source
 from uwbslam_jax.files.mcap_container import Channel, RecordWriter
+from uwbslam_jax.files.mounting import Mounting, read_mounting
+from uwbslam_jax.files.pose_messages import odometry_parts
 from uwbslam_jax.files.ros_types import definition, encode
-from uwbslam_jax.files.schemas import Decoder, Options, Role, make_decoder, plausible
+from uwbslam_jax.files.scan_messages import FIRST_LOOK, ScanReader
+from uwbslam_jax.files.schemas import Decoder, Options, Role, make_decoder, plausible, unpacker
 from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, ScanMessage, TruthMessage
 
 TRUTH_ROBOT, TRUTH_BEACON = "/ground_truth/robot", "/ground_truth/beacon/"
 """Topics of the ground truth, of a beacon without its id [topic]: none is taken for a sensor's."""
 _KEYS: dict[Role, str] = {"scan": "lidar.topic", "uwb": "uwb.topic", "odom": "odom.topic"}
 """The setting that chooses a role's topic [role -> key]: where several topics fit, the error names it."""
+_FIRST_TRANSFORMS = 500
+"""Transforms from odom to the robot are among so many messages, if there are any [messages]."""
 
 
 class LogReader:
@@ -33,7 +39,7 @@ class LogReader:
     Attributes:
       name: what messages call it.
       topics: topic -> role ("scan", "uwb", "odom", "truth") of the topics used.
-      warnings: what a user should know before the run, one line each.
+      warnings: what a user should know, one line each; some show only while iterating.
       dropped: messages left out so far, by reason; of the current iteration.
       truncated: where the recording breaks, None where it does not; a corrupt chunk shows only while iterating.
       message_count: messages on the topics used, whole and not yet decoded; for a progress bar.
@@ -47,6 +53,7 @@ class LogReader:
         scan_topic: str | None = "/scan",
         uwb_topic: str | None = "/uwb/ranges",
         odom_topic: str | None = "/odom",
+        scan_frame: str = "",
         robot_id: int = 0,
         max_range: float = 200.0,
     ):
@@ -55,6 +62,7 @@ class LogReader:
         Args:
           source: an MCAP file, a ROS 2 bag folder, or several that belong together.
           scan_topic, uwb_topic, odom_topic: where to look first; None leaves that sensor out.
+          scan_frame: frame_id of the scanner to use where a topic carries several; "" for the one with most scans.
           robot_id: id of the robot's node, for range messages that name only the other one.
           max_range: longer ranges are dropped and counted [m].
 
@@ -63,7 +71,7 @@ class LogReader:
             topic holds something else.
         """
         self._recording = Bag(source)
-        self._options = Options(robot_id, max_range)
+        self._options = Options(robot_id, max_range, ScanReader(scan_frame))
         self.name = self._recording.name
         wanted: dict[Role, str | None] = {"scan": scan_topic, "uwb": uwb_topic, "odom": odom_topic}
         try:
@@ -74,14 +82,19 @@ class LogReader:
         except LogError as error:
             broken = f"; {self._recording.truncated}" if self._recording.truncated else ""
             raise LogError(f"{self.name}: {' '.join(str(error).split())}{broken}") from None
+        look_first(self._recording, self._decoders, self._roles, self._options)
         channels = self._recording.channels
         self.topics: dict[str, Role] = {channels[number].topic: role for number, role in self._roles.items()}
-        self.warnings: list[str] = []
+        self._warnings: list[str] = []
         if uwb_topic is not None and "uwb" not in self._roles.values():
-            self.warnings.append(f"no UWB topic: {'LiDAR' if 'scan' in self._roles.values() else 'odometry'} only")
+            self._warnings.append(f"no UWB topic: {'LiDAR' if 'scan' in self._roles.values() else 'odometry'} only")
         self.duration = (self._recording.end - self._recording.start) * 1e-9
         counts = self._recording.counts
         self.message_count = sum(counts[number] for number in self._roles)
+
+    @property
+    def warnings(self) -> list[str]:
+        return [*self._warnings, *self._options.scans.told.values(), *self._options.told.values()]
 
     @property
     def dropped(self) -> Counter[str]:
@@ -90,6 +103,11 @@ class LogReader:
     @property
     def truncated(self) -> str | None:
         return self._recording.truncated
+
+    @cached_property
+    def mounting(self) -> Mounting:
+        """Where the sensors sit, as far as the recording's transforms tell."""
+        return read_mounting(self._recording, self._roles, self._options.scans.frame)
 
     @cached_property
     def truth(self) -> Truth | None:
@@ -131,6 +149,15 @@ def choose_topics(
     return decoders, roles
 
 
+def look_first(recording: Bag, decoders: dict[int, Decoder], roles: dict[int, Role], options: Options) -> None:
+    """Reads the first scans, which tell how their driver means the rest."""
+    scans = {number for number, role in roles.items() if role == "scan" and recording.counts[number]}
+    for log_time, number, data in islice(recording.records(scans) if scans else (), FIRST_LOOK):
+        decoders[number](data, log_time)
+    options.scans.settle()
+    options.dropped.clear()
+
+
 def _discover(recording: Bag, role: Role, options: Options) -> dict[int, Decoder]:
     """The channels of the only topic whose type fits the role; empty where none does. Raises LogError for several."""
     found: dict[int, Decoder] = {}
@@ -142,10 +169,24 @@ def _discover(recording: Bag, role: Role, options: Options) -> dict[int, Decoder
                 continue  # the name fits, the content does not: not a candidate
     spoken = {number: decoder for number, decoder in found.items() if recording.counts[number]}
     found = spoken or found  # a topic without a message is no rival to one with
+    if not found and role == "odom":
+        return _odometry_in_transforms(recording, options)
     topics = sorted({recording.channels[number].topic for number in found})
     if len(topics) > 1:
         raise LogError(f"several {role} topics: {', '.join(topics)}; choose with --{_KEYS[role]} TOPIC")
     return found
+
+
+def _odometry_in_transforms(recording: Bag, options: Options) -> dict[int, Decoder]:
+    """The channels of transforms that lead from odom to the robot; empty where none does."""
+    channels = [channel for channel in recording.channels.values() if plausible(channel, "tf")]
+    moving = [channel for channel in channels if recording.counts[channel.id] and not channel.topic.endswith("_static")]
+    unpack = {channel.id: unpacker(channel, "tf") for channel in moving}
+    found: set[int] = set()
+    for _, number, data in islice(recording.records(set(unpack)) if unpack else (), _FIRST_TRANSFORMS):
+        message = unpack[number](data)
+        found |= {number} if message is not None and odometry_parts(message) else set()
+    return {channel.id: make_decoder(channel, "odom", options) for channel in moving if channel.id in found}
 
 
 def _truth_decoder(channel: Channel, options: Options) -> Decoder | None:

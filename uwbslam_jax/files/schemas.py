@@ -17,18 +17,19 @@ from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any, Literal
 
-import numpy as np
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from uwbslam_jax.errors import LogError
 from uwbslam_jax.files.mcap_container import Channel
+from uwbslam_jax.files.pose_messages import odometry_parts, take_odometry, take_truth
 from uwbslam_jax.files.ros_types import STORE, UWB_RANGE
-from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, ScanMessage, TruthMessage
+from uwbslam_jax.files.scan_messages import ScanReader, foxglove_protobuf
+from uwbslam_jax.measurements import Message, RangeMessage
 from uwbslam_jax.reasons import OdometryLost, RangeLost, ScanLost
 
-Role = Literal["scan", "uwb", "odom", "truth"]
+Role = Literal["scan", "uwb", "odom", "truth", "tf"]
 Decoder = Callable[[bytes, int], list[Message]]
 
 _NAMES: dict[Role, str] = {
@@ -36,22 +37,31 @@ _NAMES: dict[Role, str] = {
     "uwb": r"UwbRange|LinktrackNodeframe[23]|.*RangeStamped",
     "odom": r"Odometry",
     "truth": r"PoseStamped|PointStamped",
+    "tf": r"(?i:tfMessage)",
 }
 """What a type is called [role -> regex]; the package does not matter, since vendors have their own."""
 SUPPORTED: dict[Role, str] = {
     "scan": "sensor_msgs/LaserScan, foxglove.LaserScan",
     "uwb": "UwbRange, LinktrackNodeframe2, LinktrackNodeframe3, RangeStamped",
-    "odom": "nav_msgs/Odometry",
+    "odom": "nav_msgs/Odometry, tf2_msgs/TFMessage",
     "truth": "geometry_msgs/PoseStamped, geometry_msgs/PointStamped",
+    "tf": "tf2_msgs/TFMessage, tf/tfMessage",
 }
 """Types that are read [role -> text], for an error about another one."""
-_WORDS: dict[Role, str] = {"scan": "scan", "uwb": "range", "odom": "odometry", "truth": "ground truth"}
+_WORDS: dict[Role, str] = {
+    "scan": "scan",
+    "uwb": "range",
+    "odom": "odometry",
+    "truth": "ground truth",
+    "tf": "transforms",
+}
 """What messages call a role [role -> text]."""
 _MALFORMED_AS: dict[Role, str] = {
     "scan": ScanLost.MALFORMED,
     "uwb": RangeLost.MALFORMED,
     "odom": OdometryLost.MALFORMED,
     "truth": "ground truth: malformed",
+    "tf": "transforms: malformed",
 }
 """How a message that does not decode is counted [role -> reason]."""
 _FIELDS: dict[Role, dict[str, set[str]]] = {
@@ -60,8 +70,9 @@ _FIELDS: dict[Role, dict[str, set[str]]] = {
         "foxglove": {"start_angle", "end_angle", "ranges"},
     },
     "uwb": {"range": {"source", "target", "range"}, "stamped": {"to_id", "range"}, "linktrack": {"id", "nodes"}},
-    "odom": {"odom": {"pose", "child_frame_id"}},
+    "odom": {"odom": {"pose", "child_frame_id"}, "tf": {"transforms"}},
     "truth": {"pose": {"header", "pose"}, "point": {"header", "point"}},
+    "tf": {"tf": {"transforms"}},
 }
 """Layouts that are read, by the fields that they need [role -> layout -> fields]."""
 _MALFORMED = (SerdeError, struct.error, AttributeError, TypeError, ValueError, LookupError, ArithmeticError)
@@ -75,12 +86,16 @@ class Options:
     Attributes:
       robot_id: id of the robot's node, for messages that name only the other one.
       max_range: longer ranges are dropped [m].
+      scans: reads the scans.
       dropped: what was left out, by reason.
+      told: what a user should know of the poses, one line each, by what it is about.
     """
 
     robot_id: int = 0
     max_range: float = 200.0
+    scans: ScanReader = field(default_factory=ScanReader)
     dropped: Counter[str] = field(default_factory=Counter)
+    told: dict[str, str] = field(default_factory=dict)
 
 
 def plausible(channel: Channel, role: Role) -> bool:
@@ -116,6 +131,22 @@ def make_decoder(channel: Channel, role: Role, options: Options) -> Decoder:
     return decode
 
 
+def unpacker(channel: Channel, role: Role) -> Callable[[bytes], Any]:
+    """From the bytes of a message of this channel to an object with its fields, None where it cannot be read."""
+    try:
+        unpack = _unpacker(channel, role)[0]
+    except LogError:
+        return lambda _: None
+
+    def read(data: bytes) -> Any:
+        try:
+            return unpack(data)
+        except _MALFORMED:
+            return None
+
+    return read
+
+
 def _base_name(schema: str) -> str:
     return re.split(r"[/.]", schema)[-1]
 
@@ -130,7 +161,7 @@ def _unpacker(channel: Channel, role: Role) -> tuple[Callable[[bytes], Any], set
     if channel.encoding == "json" and plausible(channel, role):
         return (lambda data: json.loads(data, object_hook=lambda d: SimpleNamespace(**d))), None
     if channel.encoding == "protobuf" and role == "scan" and channel.schema == "foxglove.LaserScan":
-        return _foxglove_protobuf, None
+        return foxglove_protobuf, None
     raise LogError(
         f"topic {channel.topic}: schema {channel.schema!r} in encoding {channel.encoding!r} is not supported for "
         f"a {_WORDS[role]}; supported: {SUPPORTED[role]} in cdr, ros1 or json, foxglove.LaserScan also in protobuf"
@@ -216,24 +247,6 @@ def _stamp(message: Any, log_time: int) -> int:
     return int(time.sec) * 1_000_000_000 + int(time.nsec if nanosec is None else nanosec) or log_time
 
 
-def _take_scan(message: Any, log_time: int, options: Options) -> list[Message]:
-    ranges = np.array(message.ranges, dtype=np.float32).reshape(-1)
-    if ranges.size == 0:
-        options.dropped[ScanLost.NO_BEAMS] += 1
-        return []
-    if hasattr(message, "start_angle"):  # foxglove: the sweep's two ends, no limits, taken at once
-        angle_min, time_increment, limits = float(message.start_angle), 0.0, (0.0, math.inf)
-        increment = (float(message.end_angle) - angle_min) / max(ranges.size - 1, 1)
-    else:
-        angle_min, increment = float(message.angle_min), float(message.angle_increment)
-        time_increment, limits = float(message.time_increment), (float(message.range_min), float(message.range_max))
-    if not limits[0] < limits[1]:  # drivers that leave both at 0 mean: no limits
-        limits = (0.0, math.inf)
-    if not all(map(math.isfinite, (angle_min, increment, time_increment))) or (increment == 0 and ranges.size > 1):
-        raise ValueError("bearings are not finite or all the same")
-    return [ScanMessage(_stamp(message, log_time), angle_min, increment, time_increment, *limits, ranges)]
-
-
 def _take_ranges(message: Any, log_time: int, options: Options) -> list[Message]:
     stamp = _stamp(message, log_time)
     if hasattr(message, "nodes"):
@@ -255,78 +268,14 @@ def _linktrack_id(frame: Any, node: Any) -> int:
     return int(node.id) if node.id != frame.id or node.role == frame.role else int(node.role) * 256 + int(node.id)
 
 
-def _yaw(q: Any) -> float:
-    return math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
-
-
-def _take_odometry(message: Any, log_time: int, options: Options) -> list[Message]:
-    pose = message.pose.pose
-    x, y, yaw = float(pose.position.x), float(pose.position.y), _yaw(pose.orientation)
-    if not all(map(math.isfinite, (x, y, yaw))):
-        options.dropped[OdometryLost.NOT_FINITE] += 1
-        return []
-    return [OdometryMessage(_stamp(message, log_time), x, y, yaw)]
-
-
-def _take_truth(message: Any, log_time: int, options: Options) -> list[Message]:
-    """A pose, or the point of a node that the topic names and `mcap_log` fills in."""
-    del options
-    stamp = _stamp(message, log_time)
-    if hasattr(message, "pose"):
-        p = message.pose.position
-        return [TruthMessage(stamp, None, float(p.x), float(p.y), _yaw(message.pose.orientation))]
-    return [TruthMessage(stamp, None, float(message.point.x), float(message.point.y))]
-
-
 _TAKE: dict[Role, Callable[[Any, int, Options], list[Message]]] = {
-    "scan": _take_scan,
+    "scan": lambda message, log_time, options: options.scans.take(message, _stamp(message, log_time), options.dropped),
     "uwb": _take_ranges,
-    "odom": _take_odometry,
-    "truth": _take_truth,
+    "odom": lambda message, log_time, options: [
+        found
+        for part in odometry_parts(message)
+        for found in take_odometry(part, _stamp(part, log_time), options.dropped, options.told)
+    ],
+    "truth": lambda message, log_time, _: take_truth(message, _stamp(message, log_time)),
 }
 """From an unpacked message to its measurements [role -> function]."""
-
-
-def _varint(data: bytes, position: int) -> tuple[int, int]:
-    value = shift = 0
-    while True:
-        byte = data[position]
-        value |= (byte & 0x7F) << shift
-        position, shift = position + 1, shift + 7
-        if byte < 0x80:
-            return value, position
-
-
-def _wire_fields(data: bytes) -> dict[int, list[int | bytes]]:
-    """Fields of a protobuf message by number, undecoded (protobuf.dev/programming-guides/encoding)."""
-    fields: dict[int, list[int | bytes]] = {}
-    position = 0
-    while position < len(data):
-        tag, position = _varint(data, position)
-        if tag & 7 == 0:
-            value, position = _varint(data, position)
-        else:
-            size, position = ({1: 8, 5: 4}[tag & 7], position) if tag & 7 != 2 else _varint(data, position)
-            value, position = data[position : position + size], position + size
-            if position > len(data):
-                raise ValueError("cut off")
-        fields.setdefault(tag >> 3, []).append(value)
-    return fields
-
-
-def _doubles(fields: dict[int, list[int | bytes]], number: int) -> np.ndarray:
-    parts = fields.get(number, [])
-    return np.frombuffer(b"".join(part for part in parts if isinstance(part, bytes)), "<f8")
-
-
-def _foxglove_protobuf(data: bytes) -> SimpleNamespace:
-    """A foxglove.LaserScan: 1 timestamp, 4 start and 5 end angle, 6 ranges (double, packed or not)."""
-    fields = _wire_fields(data)
-    (time,) = fields.get(1, [b""])[-1:]
-    time_fields = _wire_fields(time) if isinstance(time, bytes) else {}
-    sec, nsec = (time_fields.get(number, [0])[-1] for number in (1, 2))
-    angles = [[0.0, *_doubles(fields, number)][-1] for number in (4, 5)]
-    ranges = _doubles(fields, 6)
-    return SimpleNamespace(
-        timestamp=SimpleNamespace(sec=sec, nsec=nsec), start_angle=angles[0], end_angle=angles[1], ranges=ranges
-    )

@@ -27,6 +27,7 @@ from uwbslam_jax.measurements import (
 )
 from uwbslam_jax.numerics import between, wrapped
 from uwbslam_jax.reasons import OdometryLost, RangeLost, ScanLost, Sensor
+from uwbslam_jax.session.odometry_track import OdometryTrack
 from uwbslam_jax.settings import Settings
 
 _SCANLESS_S = 1.0
@@ -44,6 +45,8 @@ _ODOMETRY_LAGS_S = 15.0
 """Ranges wait this long for odometry that has come before."""
 _ODOMETRY_HOLD_S = 0.3
 """The last odometry is extrapolated at most this far."""
+_ROUNDING = 1e-6
+"""A reading so close to the sensor's limit is at it [ratio]: single precision."""
 
 
 class FrameAssembler:
@@ -53,6 +56,7 @@ class FrameAssembler:
       slots: node id -> slot, the robot 0; filled as ids are heard.
       dropped: what was not used, by reason. used: what was, by sensor. blank: scans of these without a return.
       warnings: one line each; that there are more beacons than slots is told once.
+      wheels: the odometry's poses so far, as one track.
       odometry_used: whether any frame carried an increment.
     """
 
@@ -62,6 +66,7 @@ class FrameAssembler:
         self.used: Counter[Sensor] = Counter()
         self.blank = 0
         self.warnings: list[str] = []
+        self.wheels = OdometryTrack()
         self.odometry_used = False
         self._settings = settings
         self._max_ranges = max_ranges
@@ -151,6 +156,9 @@ class FrameAssembler:
             self.dropped[OdometryLost.STAMP] += 1
             return []
         self.used[Sensor.ODOMETRY] += 1
+        message, joined = self.wheels.join(message)
+        if not joined:
+            self._odometry.clear()
         self._odometry.append(message)
         return self._by_odometry(message.stamp)  # the newest waits for the ranges of its own time
 
@@ -243,22 +251,25 @@ def _pose_at(track: list[OdometryMessage], stamp: int) -> tuple[float, float, fl
 
 
 def pad_scan(scan: ScanMessage | None, settings: Settings) -> Scan:
-    """A scan in the slots of a frame; more beams than slots are thinned evenly, no return is 0 and not valid."""
+    """A scan in the slots of a frame; more beams than slots are thinned evenly, no return is 0 and not valid. Bearings
+    of a LiDAR upside down are turned over."""
     beams = settings.lidar.max_beams
     ranges, valid = np.zeros(beams, np.float32), np.zeros(beams, bool)
     if scan is None:
         return Scan(ranges, valid, np.float32(0), np.float32(1e-3), np.float32(0))
     stride = -(-scan.ranges.size // beams)
     taken = np.asarray(scan.ranges[::stride], np.float32)
-    low, high = max(scan.range_min, settings.lidar.min_range), min(scan.range_max, settings.lidar.max_range)
+    low, high = max(scan.range_min, settings.lidar.min_range), settings.lidar.max_range
     with np.errstate(invalid="ignore"):
         ok = np.isfinite(taken) & (taken >= low) & (taken <= high) & (taken > 0)
+        ok &= taken < scan.range_max * (1.0 - _ROUNDING)  # many tell no return as their limit itself
     ranges[: taken.size], valid[: taken.size] = np.where(ok, taken, 0.0), ok
+    turn = -1.0 if settings.robot.lidar_flip else 1.0
     return Scan(
         ranges,
         valid,
-        np.float32(scan.angle_min),
-        np.float32(scan.angle_increment * stride),
+        np.float32(turn * scan.angle_min),
+        np.float32(turn * scan.angle_increment * stride),
         np.float32(scan.time_increment * stride),
     )
 

@@ -105,7 +105,8 @@ class Runner:
         While the robot waits for motion the beacons are those of the relative geometry, their status RELATIVE.
         """
         dropped = facts.dropped + self._assembler.dropped + self.not_located
-        warnings = [*facts.warnings, *self._assembler.warnings]
+        wheels = [*self._assembler.wheels.told(), *self.session.odometry.told()]
+        warnings = [*facts.warnings, *self._assembler.warnings, *wheels]
         told = dataclasses.replace(
             facts,
             warnings=warnings,

@@ -17,10 +17,11 @@ from uwbslam_jax.backend import BackEnd, Graph, Hindsight, notable
 from uwbslam_jax.beacons import MEMORY_S, BeaconKeeper
 from uwbslam_jax.estimator import Changes, Estimate, HostView, compiled, init
 from uwbslam_jax.mapping import Tiles
-from uwbslam_jax.measurements import StampedFrame
+from uwbslam_jax.measurements import Odometry, StampedFrame
 from uwbslam_jax.result import BeaconStatus, EventKind, MapImage, RunStatus
 from uwbslam_jax.session import saved_state
 from uwbslam_jax.session.history import History
+from uwbslam_jax.session.odometry_monitor import OdometryMonitor
 from uwbslam_jax.session.saved_state import Saved
 from uwbslam_jax.session.update import Update
 from uwbslam_jax.settings import HostParams, Params, Settings, make_config, make_host_params, make_params
@@ -43,6 +44,7 @@ class Session:
       found_bias: slot -> range bias that was found beyond the configured one [m]; empty where there is none.
       history: what was reported so far. back_end: what the run as a whole is solved by.
       listener: called with each update when stepped frame by frame, before the host has its look.
+      odometry: whether it tells of the motion that the scans show.
       fixed: whether map and beacons are taken as they are: the run only localises.
     """
 
@@ -61,7 +63,9 @@ class Session:
         self.listener: Callable[[Update], object] | None = None
         self.fixed = False
         self._slots: dict[int, int] = {settings.robot.id: 0}
+        self.odometry = OdometryMonitor()
         self._pending: list[tuple[StampedFrame, Estimate]] = []
+        self._measured: list[Odometry] = []
         self._on_host: tuple[Params | None, HostParams] = (None, make_host_params(settings, self.params))
         self._start_up = StartUp(self.host)
         self._keeper = BeaconKeeper()
@@ -109,7 +113,7 @@ class Session:
 
     def step(self, frame: StampedFrame) -> Estimate:
         """One frame in, its estimate out (numpy)."""
-        self._learn_slots(frame)
+        frame = self._admitted(frame)
         self.state, (estimate,) = compiled.step(self.config, self.params, self.state, [frame.frame])
         if self.listener is not None:
             self.listener(self.update(frame, estimate))
@@ -120,7 +124,7 @@ class Session:
         """The same for as many frames as there is room for, all at once."""
         if len(frames) != CONTROL_EVERY or self._pending:
             return [self.step(frame) for frame in frames]
-        self._learn_slots(frames[-1])
+        frames = [self._admitted(frame) for frame in frames]
         self.state, estimates = compiled.step(self.config, self.params, self.state, [f.frame for f in frames])
         for frame, estimate in zip(frames, estimates, strict=True):
             self._take(frame, estimate)
@@ -169,10 +173,16 @@ class Session:
         changes = self.back_end.finish(self._view([]), *self.history.passage())
         self._apply(changes, int(self.history.stamps[-1]) if len(self.history.stamps) else 0)
 
-    def _learn_slots(self, frame: StampedFrame) -> None:
+    def _admitted(self, frame: StampedFrame) -> StampedFrame:
+        """A frame about to be stepped: its ids are learnt, odometry that is not trusted is set aside."""
         if len(frame.slots) > len(self._slots):
             self._slots = dict(frame.slots)
             self.params = make_params(self.settings, self._slots, self.found_bias)
+        self._measured.append(frame.frame.odometry)
+        if self.odometry.trusted:
+            return frame
+        without = frame.frame._replace(odometry=Odometry(np.zeros(3, np.float32), np.bool_(False)))
+        return dataclasses.replace(frame, frame=without)
 
     def _take(self, frame: StampedFrame, estimate: Estimate) -> None:
         self.back_end.add(self.host, len(self.history.stamps) + len(self._pending), frame, estimate)
@@ -188,6 +198,8 @@ class Session:
 
     def _look(self) -> None:
         seen, self._pending = self._pending, []
+        measured, self._measured = self._measured, []
+        self.odometry.look(seen, measured)
         now = seen[-1][0].stamp
         self.history.add(seen, self.hypotheses)
         if self.settings.filter.lidar_only:
