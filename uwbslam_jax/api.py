@@ -107,7 +107,7 @@ def read(path: Paths, settings: Settings | None = None) -> LogReader:
         uwb_topic=None if s.filter.lidar_only else s.uwb.topic,
         odom_topic=s.odom.topic if s.odom.use else None,
         robot_id=s.robot.id,
-        max_range=s.uwb.max_range,
+        uwb=s.uwb,
     )
 
 
@@ -115,7 +115,7 @@ def inspect(path: Paths, settings: Settings | None = None) -> LogSummary:
     """Tells what a recording holds: topics, rates, gaps, nodes heard, what is missing; `print` it. Raises LogError."""
     s = settings or Settings()
     topics = {"scan_topic": s.lidar.topic, "uwb_topic": s.uwb.topic, "odom_topic": s.odom.topic}
-    return inspect_log(path, **topics, robot_id=s.robot.id, max_range=s.uwb.max_range)
+    return inspect_log(path, **topics, robot_id=s.robot.id, uwb=s.uwb)
 
 
 def run(

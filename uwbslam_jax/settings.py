@@ -133,11 +133,38 @@ class RobotSettings:
 
 
 @dataclass(frozen=True)
+class RangeLayout:
+    """Where things stand in a message of another radio, by paths: "distance", "tags[].anchors[].dis".
+
+    A path goes through the same lists as that of the range, or beside them: "anchors[].id", "tag.id", "ids[]".
+    """
+
+    type: str = ""
+    """Name of the message's type, with or without its package, as "UwbFrame"; empty where none is described."""
+    source: str = ""
+    """Path of the node that ranges; the robot's where not given."""
+    target: str = ""
+    """Path of the node that it ranges to, "@index" for the place in the list; where not given, the topic names it."""
+    range: str = ""
+    """Path of the range."""
+    unit: Literal["m", "cm", "mm"] = "m"
+    """Unit of the range."""
+    stamp: str = ""
+    """Path of the time: a ROS time, a float of seconds or an integer of nanoseconds; the header's where not given."""
+    receive_power: str = ""
+    """Path of the receive power [dBm]."""
+    first_path_power: str = ""
+    """Path of the first-path power [dBm]."""
+
+
+@dataclass(frozen=True)
 class UwbSettings:
     """Ranging."""
 
     topic: str = "/uwb/ranges"
-    """Topic of the ranges."""
+    """Topic of the ranges; with * in it, several that are one radio's, as "/anchor_*/range"."""
+    unit: Literal["auto", "m", "cm", "mm"] = "auto"
+    """Unit of the recorded ranges; auto: what their message says, unless only another one explains them."""
     sigma_n: float = 0.1
     """Standard deviation of a range [m]."""
     nlos_gap_db: float = 10.0
@@ -154,6 +181,8 @@ class UwbSettings:
     """Part of a range's bias that grows with the distance [m/m]: range = (1 + bias_scale) * distance + both biases."""
     fit_offset: bool = False
     """Whether the relative geometry of nodes at rest has a bias common to all ranges as an unknown."""
+    message: RangeLayout = field(default_factory=RangeLayout)
+    """Where things stand in a message that is not known, section [uwb.message]."""
 
 
 @dataclass(frozen=True)

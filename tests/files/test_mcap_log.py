@@ -21,6 +21,7 @@ from uwbslam_jax.errors import LogError
 from uwbslam_jax.files import log_summary, mcap_container, ros_types
 from uwbslam_jax.files.mcap_log import LogReader, LogWriter
 from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, ScanMessage, TruthMessage
+from uwbslam_jax.settings import UwbSettings
 
 T0 = 1_700_000_000_123_456_789  # ns; no float64 holds it
 MS = 1_000_000
@@ -528,7 +529,7 @@ class TestContent:
             "range: over 200 m": 1,
             "range: from a node to itself": 1,
         }
-        far = LogReader(tmp_path / "a.mcap", max_range=300.0)
+        far = LogReader(tmp_path / "a.mcap", uwb=UwbSettings(max_range=300.0))
         assert [m.range for m in far if isinstance(m, RangeMessage)] == [201.0, 199.0]
 
     @settings(max_examples=30)

@@ -9,8 +9,10 @@ from dataclasses import dataclass, field
 from uwbslam_jax.errors import LogError
 from uwbslam_jax.files.bag import Bag, Source
 from uwbslam_jax.files.mcap_log import choose_topics
-from uwbslam_jax.files.schemas import Decoder, Options, Role
+from uwbslam_jax.files.range_messages import Options
+from uwbslam_jax.files.schemas import Decoder, Role
 from uwbslam_jax.measurements import Message, RangeMessage, ScanMessage
+from uwbslam_jax.settings import UwbSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,14 +101,14 @@ def inspect_log(
     uwb_topic: str | None = "/uwb/ranges",
     odom_topic: str | None = "/odom",
     robot_id: int = 0,
-    max_range: float = 200.0,
+    uwb: UwbSettings | None = None,
 ) -> LogSummary:
     """Reads a recording through and says what it holds; arguments as for `LogReader`.
 
     Raises:
       LogError: the file cannot be read at all. Missing or ambiguous topics are `problems` of the summary.
     """
-    recording, options = Bag(source), Options(robot_id, max_range)
+    recording, options = Bag(source), Options.of(uwb or UwbSettings(), robot_id)
     decoders: dict[int, Decoder] = {}
     roles: dict[int, Role] = {}
     problems: list[str] = []

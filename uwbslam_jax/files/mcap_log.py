@@ -9,6 +9,7 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Iterator
+from fnmatch import fnmatchcase
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
@@ -17,9 +18,11 @@ from uwbslam_jax.errors import LogError as LogError
 from uwbslam_jax.evaluation import Truth
 from uwbslam_jax.files.bag import Bag, Source
 from uwbslam_jax.files.mcap_container import Channel, RecordWriter
+from uwbslam_jax.files.range_messages import Options
 from uwbslam_jax.files.ros_types import definition, encode
-from uwbslam_jax.files.schemas import Decoder, Options, Role, make_decoder, plausible
+from uwbslam_jax.files.schemas import Decoder, Role, make_decoder, names_no_node, of_a_radio, plausible
 from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, ScanMessage, TruthMessage
+from uwbslam_jax.settings import UwbSettings
 
 TRUTH_ROBOT, TRUTH_BEACON = "/ground_truth/robot", "/ground_truth/beacon/"
 """Topics of the ground truth, of a beacon without its id [topic]: none is taken for a sensor's."""
@@ -48,7 +51,7 @@ class LogReader:
         uwb_topic: str | None = "/uwb/ranges",
         odom_topic: str | None = "/odom",
         robot_id: int = 0,
-        max_range: float = 200.0,
+        uwb: UwbSettings | None = None,
     ):
         """Opens a recording and chooses its topics: those named, else the only one of a fitting type.
 
@@ -56,14 +59,14 @@ class LogReader:
           source: an MCAP file, a ROS 2 bag folder, or several that belong together.
           scan_topic, uwb_topic, odom_topic: where to look first; None leaves that sensor out.
           robot_id: id of the robot's node, for range messages that name only the other one.
-          max_range: longer ranges are dropped and counted [m].
+          uwb: unit, greatest range and layout of the ranges; the defaults where not given.
 
         Raises:
           LogError: the file cannot be read, has neither scans nor odometry nor ranges, leaves a choice open, or a named
             topic holds something else.
         """
         self._recording = Bag(source)
-        self._options = Options(robot_id, max_range)
+        self._options = Options.of(uwb or UwbSettings(), robot_id)
         self.name = self._recording.name
         wanted: dict[Role, str | None] = {"scan": scan_topic, "uwb": uwb_topic, "odom": odom_topic}
         try:
@@ -79,6 +82,7 @@ class LogReader:
         self.warnings: list[str] = []
         if uwb_topic is not None and "uwb" not in self._roles.values():
             self.warnings.append(f"no UWB topic: {'LiDAR' if 'scan' in self._roles.values() else 'odometry'} only")
+        self.warnings += self._options.told
         self.duration = (self._recording.end - self._recording.start) * 1e-9
         counts = self._recording.counts
         self.message_count = sum(counts[number] for number in self._roles)
@@ -118,8 +122,9 @@ def choose_topics(
     for role, topic in wanted.items():
         if topic is None:
             continue
-        chosen = [channel for channel in recording.channels.values() if channel.topic == topic]
+        chosen = [channel for channel in recording.channels.values() if fnmatchcase(channel.topic, topic)]
         if chosen:
+            options.joined = sorted({channel.topic for channel in chosen}) if role == "uwb" else options.joined
             found = {channel.id: make_decoder(channel, role, options) for channel in chosen}
         else:
             found = _discover(recording, role, options)
@@ -132,20 +137,49 @@ def choose_topics(
 
 
 def _discover(recording: Bag, role: Role, options: Options) -> dict[int, Decoder]:
-    """The channels of the only topic whose type fits the role; empty where none does. Raises LogError for several."""
-    found: dict[int, Decoder] = {}
+    """The channels of the only topic whose type fits the role; empty where none does. Raises LogError for several.
+
+    Of ranges: also those of all topics that have one node's each.
+    """
+    found: dict[int, tuple[int, Decoder]] = {}
+    joined: list[Channel] = []
+    unread: list[str] = []
     for channel in recording.channels.values():
-        if plausible(channel, role) and not channel.topic.startswith("/ground_truth"):
-            try:
-                found[channel.id] = make_decoder(channel, role, options)
-            except LogError:
-                continue  # the name fits, the content does not: not a candidate
-    spoken = {number: decoder for number, decoder in found.items() if recording.counts[number]}
-    found = spoken or found  # a topic without a message is no rival to one with
-    topics = sorted({recording.channels[number].topic for number in found})
+        rank = plausible(channel, role, options)
+        if rank is None or channel.topic.startswith("/ground_truth"):
+            continue
+        try:
+            decoder = make_decoder(channel, role, options)
+            if role == "uwb" and names_no_node(channel, options):
+                joined += [channel] * (recording.counts[channel.id] > 0)
+            else:
+                found[channel.id] = rank, decoder
+        except LogError as error:  # the name fits, the content does not: not a candidate
+            unread += [str(error)] * (recording.counts[channel.id] > 0)
+    # a topic without a message is no rival to one with, nor one whose name says less
+    spoken = {number: each for number, each in found.items() if recording.counts[number]} or found
+    best = min((rank for rank, _ in spoken.values()), default=0)
+    fitting = {number: decoder for number, (rank, decoder) in spoken.items() if rank == best}
+    topics = sorted({recording.channels[number].topic for number in fitting})
     if len(topics) > 1:
         raise LogError(f"several {role} topics: {', '.join(topics)}; choose with --{_KEYS[role]} TOPIC")
-    return found
+    if not fitting:
+        fitting = _of_one_radio(joined, unread, options)
+        options.told += unread if role == "uwb" and not fitting else []
+    return fitting
+
+
+def _of_one_radio(joined: list[Channel], unread: list[str], options: Options) -> dict[int, Decoder]:
+    """Decoders of the topics that have one node's ranges each, if they are a radio's; else told in unread."""
+    ours = [channel for channel in joined if of_a_radio(channel)] or (joined if options.message.type else [])
+    options.joined = sorted({channel.topic for channel in ours})
+    if joined and not ours:
+        names = ", ".join(sorted({channel.topic for channel in joined}))
+        unread.append(
+            f"ranges to no named node on {names} are not taken for a radio's: if they are, "
+            "--uwb.topic names them, with * for several"
+        )
+    return {channel.id: make_decoder(channel, "uwb", options) for channel in ours}
 
 
 def _truth_decoder(channel: Channel, options: Options) -> Decoder | None:
