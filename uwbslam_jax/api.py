@@ -371,10 +371,12 @@ def _opened(source: Source, settings: Settings | None) -> tuple[LogReader | Iter
     if settings is None:
         settings = source.settings if isinstance(source, Simulation) else Settings()
     settings_file.check(settings)
-    if isinstance(source, LogReader | Simulation) or _are_messages(source):
+    if isinstance(source, Simulation) or _are_messages(source):
         return source, settings
     if isinstance(source, str | Path | Sequence):
-        return read(cast(Paths, source), settings), settings
+        source = read(cast(Paths, source), settings)
+    if isinstance(source, LogReader):
+        return source, dataclasses.replace(settings, robot=dataclasses.replace(settings.robot, id=source.robot_id))
     return list(source), settings
 
 

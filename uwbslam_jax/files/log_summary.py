@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 
 from uwbslam_jax.errors import LogError
 from uwbslam_jax.files.bag import Bag, Source
+from uwbslam_jax.files.first_ranges import look_ahead
 from uwbslam_jax.files.mcap_log import choose_topics
-from uwbslam_jax.files.range_messages import Options
+from uwbslam_jax.files.range_messages import Options, names_told
 from uwbslam_jax.files.schemas import Decoder, Role
 from uwbslam_jax.measurements import Message, RangeMessage, ScanMessage
 from uwbslam_jax.settings import UwbSettings
@@ -121,6 +122,8 @@ def inspect_log(
                 problems.append(f"no {role} topic")
         except LogError as error:
             problems.append(str(error))
+    ranges = {number: decode for number, decode in decoders.items() if roles[number] == "uwb"}
+    look_ahead(recording, ranges, options, scans=bool({"scan", "odom"} & set(roles.values())))
     topic_of = {channel.id: channel.topic for channel in recording.channels.values()}
     clocks = {topic: _Clock() for topic in topic_of.values()}
     heard = _Heard()
@@ -141,7 +144,7 @@ def inspect_log(
         ground_truth="truth" in roles.values(),
         beams=heard.beams,
         dropped=options.dropped,
-        problems=problems,
+        problems=[*problems, *options.told, *names_told(options)],
         truncated=recording.truncated,
     )
 

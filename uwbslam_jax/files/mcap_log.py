@@ -17,8 +17,9 @@ from types import TracebackType
 from uwbslam_jax.errors import LogError as LogError
 from uwbslam_jax.evaluation import Truth
 from uwbslam_jax.files.bag import Bag, Source
+from uwbslam_jax.files.first_ranges import look_ahead
 from uwbslam_jax.files.mcap_container import Channel, RecordWriter
-from uwbslam_jax.files.range_messages import Options
+from uwbslam_jax.files.range_messages import Options, names_told
 from uwbslam_jax.files.ros_types import definition, encode
 from uwbslam_jax.files.schemas import Decoder, Role, make_decoder, names_no_node, of_a_radio, plausible
 from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, ScanMessage, TruthMessage
@@ -36,7 +37,8 @@ class LogReader:
     Attributes:
       name: what messages call it.
       topics: topic -> role ("scan", "uwb", "odom", "truth") of the topics used.
-      warnings: what a user should know before the run, one line each.
+      robot_id: id of the robot's node: the one given, or another that the ranges tell it is.
+      warnings: what a user should know before the run, one line each; what named nodes are called, as far as heard.
       dropped: messages left out so far, by reason; of the current iteration.
       truncated: where the recording breaks, None where it does not; a corrupt chunk shows only while iterating.
       message_count: messages on the topics used, whole and not yet decoded; for a progress bar.
@@ -79,13 +81,23 @@ class LogReader:
             raise LogError(f"{self.name}: {' '.join(str(error).split())}{broken}") from None
         channels = self._recording.channels
         self.topics: dict[str, Role] = {channels[number].topic: role for number, role in self._roles.items()}
-        self.warnings: list[str] = []
+        self._warnings: list[str] = []
         if uwb_topic is not None and "uwb" not in self._roles.values():
-            self.warnings.append(f"no UWB topic: {'LiDAR' if 'scan' in self._roles.values() else 'odometry'} only")
-        self.warnings += self._options.told
+            self._warnings.append(f"no UWB topic: {'LiDAR' if 'scan' in self._roles.values() else 'odometry'} only")
+        ranges = {number: decode for number, decode in self._decoders.items() if self._roles[number] == "uwb"}
+        look_ahead(self._recording, ranges, self._options, scans=bool({"scan", "odom"} & set(self._roles.values())))
+        self._warnings += self._options.told
         self.duration = (self._recording.end - self._recording.start) * 1e-9
         counts = self._recording.counts
         self.message_count = sum(counts[number] for number in self._roles)
+
+    @property
+    def warnings(self) -> list[str]:
+        return [*self._warnings, *names_told(self._options)]
+
+    @property
+    def robot_id(self) -> int:
+        return self._options.robot_id
 
     @property
     def dropped(self) -> Counter[str]:

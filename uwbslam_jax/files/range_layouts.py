@@ -43,7 +43,7 @@ class Layout:
     """Where things stand in a message: paths as "tags[].anchors[].dis", of what stands in the range's lists beside it.
 
     Attributes:
-      range: of the distances; unit: of these.
+      range: of the distances; unit: of these, "" where nothing tells it; whole: whether they are whole numbers.
       source, target: of the nodes; "@robot": the robot's, "@topic": what the topic calls it, "@index": its place in the
         list.
       stamp: of the time, "" for the usual places. powers: receive and first path [dBm], "" where there is none.
@@ -54,7 +54,8 @@ class Layout:
     range: str
     source: str
     target: str
-    unit: str = "m"
+    unit: str = ""
+    whole: bool = False
     stamp: str = ""
     powers: tuple[str, str] = ("", "")
     roles: tuple[str, str] = ("", "")
@@ -66,7 +67,8 @@ def described(message: RangeLayout) -> Layout:
     """The layout that a user has described."""
     ends = message.source or "@robot", message.target or "@topic"
     powers = message.receive_power, message.first_path_power
-    return Layout(message.range, *ends, message.unit, message.stamp, powers, apart=message.source == "")
+    apart = message.source == ""
+    return Layout(message.range, *ends, message.unit, stamp=message.stamp, powers=powers, apart=apart)
 
 
 def fields_of_type(definitions: dict[str, Any], name: str) -> dict[str, str]:
@@ -136,7 +138,8 @@ def find_layout(fields: dict[str, str]) -> Layout | None:
         return Layout(
             own[name],
             *ends,
-            unit=_unit(name, fields[own[name]]),
+            unit=_unit(name),
+            whole="int" in fields[own[name]],
             powers=(_first(own, _RECEIVE) or "", _first(own, _FIRST_PATH) or ""),
             roles=(roles[0], roles[1]) if all(roles) else ("", ""),
             valid=next((path for name, path in own.items() if name in _VALID and fields[path] == "bool"), ""),
@@ -148,7 +151,7 @@ def find_layout(fields: dict[str, str]) -> Layout | None:
 def one_a_topic(fields: dict[str, str]) -> Layout | None:
     """The layout of a message that tells a range and names no node: its topic does, or its frame."""
     name = _first({_plain(path): path for path in fields if _stands_in(path, "")}, _RANGES)
-    return Layout(name, "@robot", "@topic", _unit(_plain(name), fields[name]), apart=True) if name else None
+    return Layout(name, "@robot", "@topic", _unit(_plain(name)), "int" in fields[name], apart=True) if name else None
 
 
 def _lists_beside(fields: dict[str, str]) -> Layout | None:
@@ -164,7 +167,7 @@ def _lists_beside(fields: dict[str, str]) -> Layout | None:
         if ids is None and _plain(name) not in _BY_PLACE:
             continue
         source = _first(own, (*_SOURCES, *_OF_LIST)) or "@robot"
-        return Layout(path, source, ids or "@index", unit=_unit(_plain(name), kind), apart=True)
+        return Layout(path, source, ids or "@index", _unit(_plain(name)), "int" in kind, apart=True)
     return None
 
 
@@ -191,7 +194,7 @@ def _beside(path: str, name: str, fields: dict[str, str]) -> str:
     return found if found in fields else ""
 
 
-def _unit(name: str, kind: str) -> str:
-    """Unit of a distance by its name, or by its kind: who counts in whole numbers counts millimetres."""
+def _unit(name: str) -> str:
+    """Unit of a distance by its name."""
     told = re.search("(mm|cm)$", name)
-    return told[1] if told else "mm" if "int" in kind else "m"
+    return told[1] if told else ""

@@ -39,7 +39,8 @@ class Options:
       max_range: longer ranges are dropped [m].
       dropped: what was left out, by reason.
       unit: of the ranges; "auto": what their message says, times scale.
-      scale: what ranges are to be multiplied with besides, as found out from them.
+      scale: what ranges are to be multiplied with besides, as found out from them; whole: whether messages count them
+        in whole numbers, which are millimetres if nothing speaks against it; None where their unit is told.
       message: the user's description of a message, whose type is "" where there is none.
       joined: topics that are one radio's, each with the ranges to one node.
       names: node ids by the names that messages call them.
@@ -51,6 +52,7 @@ class Options:
     dropped: Counter[str] = field(default_factory=Counter)
     unit: Literal["auto", "m", "cm", "mm"] = "auto"
     scale: float = 1.0
+    whole: bool | None = False
     message: RangeLayout = field(default_factory=RangeLayout)
     joined: list[str] = field(default_factory=list)
     names: dict[str, int] = field(default_factory=dict)
@@ -103,6 +105,14 @@ class Options:
         return number
 
 
+def names_told(options: Options) -> list[str]:
+    """One line that tells which numbers named nodes have, empty where they are called by their numbers."""
+    names = {name: number for name, number in options.names.items() if name not in ("@robot", str(number))}
+    told = [f"{number} is {name}" for name, number in sorted(names.items(), key=lambda item: item[1])]
+    more = f" and {len(told) - 20} more" if len(told) > 20 else ""
+    return [f"nodes have names, these are their ids: {', '.join(told[:20])}{more}"] if told else []
+
+
 class _Place(NamedTuple):
     """One element of the list that holds the ranges: the message, the elements of its lists, the last one's place."""
 
@@ -152,6 +162,8 @@ def range_taker(layout: Layout, topic: str, options: Options) -> Callable[[Any, 
     ends = [_end(path, lists, topic, options) for path in (layout.source, layout.target)]
     others = layout.range, layout.stamp, layout.valid, *layout.powers, *layout.roles
     get = {path: _getter(path, lists) for path in others if path}
+    options.whole = None if layout.unit else layout.whole
+    unit = layout.unit or ("mm" if layout.whole else "m")
     if layout.source == "@robot":
         options.names.setdefault("@robot", options.robot_id)  # no name of another node means this id
 
@@ -169,7 +181,7 @@ def range_taker(layout: Layout, topic: str, options: Options) -> Callable[[Any, 
             if source == target:
                 own, other = (int(get[path](place)) if path else 0 for path in layout.roles)
                 target += _OTHER_NODE * (other if other != own else int(layout.apart))
-            metres = measured * METRES[layout.unit if options.unit == "auto" else options.unit] * options.scale
+            metres = measured * METRES[unit if options.unit == "auto" else options.unit] * options.scale
             powers = [float(get[path](place)) if path else math.nan for path in layout.powers]
             at = _time(get[layout.stamp](place)) if layout.stamp else stamp_of(place.levels[-1], stamp)
             found += checked(RangeMessage(at or stamp, source, target, metres, *powers), options)
