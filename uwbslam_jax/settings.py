@@ -6,7 +6,7 @@ it may be a static argument of a jitted function. Params are the differentiable 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
@@ -170,7 +170,7 @@ class UwbSettings:
     nlos_gap_db: float = 10.0
     """A range whose receive power exceeds its first-path power by more than this [dB] is taken as NLOS and ignored."""
     max_beacons: int = 8
-    """Slots for beacons; ids beyond are counted and ignored."""
+    """Slots for beacons to begin with; where more are heard, room is made in the run, which compiles anew."""
     max_range: float = 200.0
     """Longer ranges are dropped and counted [m]."""
     height: dict[str, float] = field(default_factory=dict)
@@ -271,6 +271,18 @@ class Settings:
     odom: OdomSettings = field(default_factory=OdomSettings)
     map: MapSettings = field(default_factory=MapSettings)
     filter: FilterSettings = field(default_factory=FilterSettings)
+
+
+MOST_BEACONS = 200
+"""Of more beacons a step's covariance alone takes megabytes and seconds [beacons]."""
+
+
+def with_room(settings: Settings, beacons: int) -> Settings:
+    """Settings with slots for so many beacons: uwb.max_beacons is doubled as often as it takes, to MOST_BEACONS."""
+    room = settings.uwb.max_beacons
+    while room < min(beacons, MOST_BEACONS):
+        room = min(2 * room, MOST_BEACONS)
+    return replace(settings, uwb=replace(settings.uwb, max_beacons=room))
 
 
 def make_config(settings: Settings) -> Config:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from uwbslam_jax.errors import ConfigError
-from uwbslam_jax.settings import RangeLayout, Settings
+from uwbslam_jax.settings import MOST_BEACONS, RangeLayout, Settings
 
 _MAX_CELLS = 4096
 """Side of the matching window at its finest level [cells]; beyond this the maps alone take gigabytes."""
@@ -34,7 +34,7 @@ _MAY_BE_INFINITE = ["uwb.nlos_gap_db"]
 """Settings whose infinity switches their rule off [keys]."""
 _LIMITS = {
     "robot.id": (0, 2**32 - 1),
-    "uwb.max_beacons": (1, 200),
+    "uwb.max_beacons": (1, MOST_BEACONS),
     "lidar.max_beams": (1, 100_000),
     "map.levels": (1, 5),
     "uwb.bias_scale": (-0.5, 1.0),

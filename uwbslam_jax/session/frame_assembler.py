@@ -26,13 +26,15 @@ from uwbslam_jax.measurements import (
     TruthMessage,
 )
 from uwbslam_jax.numerics import between, wrapped
-from uwbslam_jax.settings import Settings
+from uwbslam_jax.settings import Settings, make_config, with_room
 
 _SCANLESS_S = 1.0
 """Ranges wait this long for a scan before they make a frame of their own."""
 _BLIND_S, _BLIND_SCANS = 0.2, 2
 """Once a LiDAR has fallen silent they wait only so long, or so many of its usual intervals where those are longer: no
 velocity predicts a turning robot for a second, but a slow scanner is not a silent one."""
+_OFTEN = 5
+"""An id that would need more slots gets one once it was heard so often: single ones are errors of a radio [ranges]."""
 _INTERVALS = 9
 """So many intervals between scans tell the usual one."""
 _WITHOUT_SCAN_S = 3.0
@@ -51,7 +53,7 @@ class FrameAssembler:
     Attributes:
       slots: node id -> slot, the robot 0; filled as ids are heard.
       dropped: what was not used, by reason.
-      warnings: one line each; that there are more beacons than slots is told once.
+      warnings: one line each; that there are more beacons than slots is told once for each time.
       odometry_used: whether any frame carried an increment.
     """
 
@@ -62,6 +64,7 @@ class FrameAssembler:
         self.odometry_used = False
         self._settings = settings
         self._max_ranges = max_ranges
+        self._seldom: Counter[int] = Counter()  # ids without a slot
         self._ranges: list[RangeMessage] = []
         self._newest_range: dict[tuple[int, int], int] = {}
         self._odometry: list[OdometryMessage] = []
@@ -126,7 +129,7 @@ class FrameAssembler:
             self.dropped["range: arrived too late"] += 1
             return []
         if self._slot(message.source) is None or self._slot(message.target) is None:
-            self.dropped["range: more beacons than max_beacons"] += 1
+            self.dropped["range: of a node heard too seldom, or more beacons than max_beacons"] += 1
             return []
         self._newest_range[pair] = message.stamp
         self._ranges.append(message)
@@ -163,14 +166,28 @@ class FrameAssembler:
         return frames
 
     def _slot(self, node: int) -> int | None:
+        """The slot of a node; None for one that there is no slot for, as yet or at all."""
         if node not in self.slots:
             most = self._settings.uwb.max_beacons
             if len(self.slots) > most:
-                if not self.warnings:
-                    self.warnings.append(f"node {node} is ignored: more than {most} beacons, see uwb.max_beacons")
-                return None
+                self._seldom[node] += 1
+                if self._seldom[node] < _OFTEN or not self._make_room(node):
+                    return None
             self.slots[node] = len(self.slots)
         return self.slots[node]
+
+    def _make_room(self, node: int) -> bool:
+        """Whether there are more slots now."""
+        most = self._settings.uwb.max_beacons
+        self._settings = with_room(self._settings, most + 1)
+        self._max_ranges = make_config(self._settings).max_ranges
+        room = self._settings.uwb.max_beacons
+        told = f"more than {most} beacons were heard: "
+        if room > most:
+            self.warnings.append(f"{told}room was made for {room} in the run, --uwb.max-beacons {room} makes it before")
+        elif self._seldom[node] == _OFTEN:
+            self.warnings.append(f"{told}node {node} is ignored, there is room for no more")
+        return room > most
 
     def _without_scan(self, before: int | None) -> list[StampedFrame]:
         """Frames for ranges that have waited: one whenever they span too long or fill a frame."""

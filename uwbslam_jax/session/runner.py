@@ -130,7 +130,7 @@ class Runner:
 
     def _take(self, frame: StampedFrame) -> list[Update]:
         self._waiting.append(frame)
-        return self._step() if len(self._waiting) == self._group else []
+        return self._step() if len(self._waiting) >= min(self._group, self.session.room()) else []
 
     def _step(self) -> list[Update]:
         frames, self._waiting = self._waiting, []
