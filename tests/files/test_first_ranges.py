@@ -87,6 +87,7 @@ def test_the_robots_node_is_found(tmp_path: Path, how: dict[str, Any], beacons: 
     reader = LogReader(path)
     if 0 in beacons and how.get("all_pairs", True):
         assert reader.robot_id == 0  # in several pairs: nothing is changed that may be right
+        assert any("if that is the robot's, say --robot.id 27" in told for told in reader.warnings)
         return
     assert reader.robot_id == 27
     assert any("--robot.id 27" in told for told in reader.warnings)

@@ -150,6 +150,19 @@ def test_ids_that_are_heard_once_get_no_more_slots_than_there_are():
     assert make.warnings == []
 
 
+def test_a_robot_that_is_not_heard_is_told():
+    make = assembler()
+    list(make.frames([ranged(0.0, 5, 27), *(ranged(0.01 + k / 100, 6, 27) for k in range(6)), scan(0.1)]))
+    assert make.missing() == [
+        "robot.id = 0 is never heard among the nodes 5, 6, 27: name the robot's own, --robot.id ID"
+    ]
+    list(make.frames([ranged(0.2, 0, 5), scan(0.3)]))
+    assert make.missing() == []
+    without_scans = assembler()
+    list(without_scans.frames([ranged(0.0, 5, 27), ranged(0.01, 5, 28)]))
+    assert without_scans.missing() == []
+
+
 def test_there_is_an_end_to_room(monkeypatch):
     monkeypatch.setattr("uwbslam_jax.settings.MOST_BEACONS", 3)
     make = assembler()

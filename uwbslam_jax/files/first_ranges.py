@@ -16,6 +16,7 @@ from uwbslam_jax.files.bag import Bag
 from uwbslam_jax.files.range_messages import METRES, Options
 from uwbslam_jax.files.schemas import Decoder
 from uwbslam_jax.measurements import RangeMessage
+from uwbslam_jax.session import robot_unheard
 
 _LOOKS = (300, 1200, 4800, 19200)
 """So many ranges are read before each look [ranges]: the first suffices for nearly all, the last is minutes long."""
@@ -87,14 +88,21 @@ class FirstRanges:
         fitting = [unit for unit in METRES if typical * METRES[unit] / METRES[usual] <= max_range]
         return min(fitting, key=odds, default=usual)
 
-    def robot(self, robot_id: int, metres: float) -> int | None:
-        """The node that is the robot's by its motion, None where none is; metres: of the ranges' unit."""
+    def moving(self, metres: float) -> list[tuple[int, int]]:
+        """Pairs whose ranges change; metres: of the ranges' unit."""
         least = max(_MOVED_M, _MOVED_NOISES * self.noise() * metres)
-        spread = {pair: float(np.ptp(np.quantile(v, (0.05, 0.95)))) * metres for pair, v in self.pairs.items()}
-        moving = [pair for pair in spread if spread[pair] > least and robot_id not in pair]
+        return [pair for pair, v in self.pairs.items() if np.ptp(np.quantile(v, (0.05, 0.95))) * metres > least]
+
+    def robot(self, robot_id: int, metres: float) -> int | None:
+        """The node other than this one that is the robot's by its motion, None where none is."""
+        moving = [pair for pair in self.moving(metres) if robot_id not in pair]
         nodes = set.intersection(*map(set, moving)) if len(moving) > 1 else set()
-        own = [pair for pair in spread if nodes & set(pair)]
+        own = [pair for pair in self.pairs if nodes & set(pair)]
         return nodes.pop() if len(nodes) == 1 and 2 * len(moving) >= len(own) else None
+
+    def moves(self, node: int, metres: float) -> bool:
+        """Whether a node moves, or there are no ranges without it to compare it with."""
+        return all(node in pair for pair in self.pairs) or any(node in pair for pair in self.moving(metres))
 
     def centre(self) -> int | None:
         """The one node that is part of every pair, of two at least."""
@@ -122,14 +130,15 @@ def look_ahead(recording: Bag, decoders: Mapping[int, Decoder], options: Options
                 first.add(message)
         if first.count >= at:
             plain = first.count >= _LOOKS[1] or _unit(first, options, longest) is None
-            known = not scans or first.hears(options.robot_id) or first.robot(options.robot_id, 1.0) is not None
+            other = first.robot(options.robot_id, 1.0) is not None
+            known = not scans or other or (first.hears(options.robot_id) and first.moves(options.robot_id, 1.0))
             at = 0 if plain and known else next(looks, 0)
             if not at:
                 break
     options.max_range = longest
     options.dropped.clear()
     _settle_unit(first, options)
-    if scans and first.pairs and not first.hears(options.robot_id):
+    if scans and first.pairs:
         _settle_robot(first, options)
 
 
@@ -156,6 +165,15 @@ def _settle_unit(first: FirstRanges, options: Options) -> None:
 
 def _settle_robot(first: FirstRanges, options: Options) -> None:
     wanted, nodes = options.robot_id, first.nodes
+    if first.hears(wanted):
+        other = first.robot(wanted, options.scale)
+        still = [pair for pair in first.moving(options.scale) if wanted in pair and other not in pair]
+        if other is not None and not still:
+            options.told.append(
+                f"robot.id = {wanted} rests among the others, and node {other} is the one whose ranges change: "
+                f"if that is the robot's, say --robot.id {other}"
+            )
+        return
     heard = "is heard by one node only" if wanted in nodes else "is never heard"
     found = first.robot(wanted, options.scale)
     if found is None and wanted not in nodes:
@@ -169,5 +187,4 @@ def _settle_robot(first: FirstRanges, options: Options) -> None:
         options.robot_id = found
         options.names |= {"@robot": found} if "@robot" in options.names else {}
     elif wanted not in nodes:
-        among = ", ".join(map(str, nodes[:12])) + (" ..." if len(nodes) > 12 else "")
-        options.told.append(f"robot.id = {wanted} {heard} among the nodes {among}: name the robot's own, --robot.id ID")
+        options.told.append(robot_unheard(wanted, nodes))

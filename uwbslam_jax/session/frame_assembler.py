@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 
 import numpy as np
 
@@ -35,6 +35,8 @@ _BLIND_S, _BLIND_SCANS = 0.2, 2
 velocity predicts a turning robot for a second, but a slow scanner is not a silent one."""
 _OFTEN = 5
 """An id that would need more slots gets one once it was heard so often: single ones are errors of a radio [ranges]."""
+_TELLING_PAIRS = 2
+"""Where so many pairs of nodes were heard and the robot in none, its id may be another [pairs]."""
 _INTERVALS = 9
 """So many intervals between scans tell the usual one."""
 _WITHOUT_SCAN_S = 3.0
@@ -91,6 +93,13 @@ class FrameAssembler:
             case TruthMessage():
                 pass
         return []
+
+    def missing(self) -> list[str]:
+        """One line where a robot that drives was not heard so far, though the others were."""
+        pairs, robot = self._newest_range, self._settings.robot.id
+        drives = self._scan_at is not None and len(pairs) >= _TELLING_PAIRS
+        heard = any(robot in pair for pair in pairs)
+        return [robot_unheard(robot, set(self.slots) - {robot})] if drives and not heard else []
 
     def flush(self) -> list[StampedFrame]:
         """Frames of the ranges and the odometry that no scan came for, at the end of a stream."""
@@ -241,6 +250,12 @@ class FrameAssembler:
         increment = between(np.array(a), np.array(b))
         increment[2] = wrapped(increment[2])
         return Odometry(increment.astype(np.float32), np.bool_(True))
+
+
+def robot_unheard(robot_id: int, nodes: Collection[int]) -> str:
+    """Warning that the robot's node is none of those heard."""
+    among = ", ".join(map(str, sorted(nodes)[:12])) + (" ..." if len(nodes) > 12 else "")
+    return f"robot.id = {robot_id} is never heard among the nodes {among}: name the robot's own, --robot.id ID"
 
 
 def _pose_at(track: list[OdometryMessage], stamp: int) -> tuple[float, float, float]:

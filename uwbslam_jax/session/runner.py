@@ -103,7 +103,7 @@ class Runner:
         While the robot waits for motion the beacons are those of the relative geometry, their status RELATIVE.
         """
         dropped = facts.dropped + self._assembler.dropped + self.not_located
-        warnings = [*facts.warnings, *self._assembler.warnings]
+        warnings = list(dict.fromkeys([*facts.warnings, *self._assembler.warnings, *self._assembler.missing()]))
         told = dataclasses.replace(
             facts,
             warnings=warnings,
