@@ -5,6 +5,7 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -65,9 +66,9 @@ def write_db3(path: Path, messages: list[Message]) -> Path:
 
 
 def write_ros1(path: Path, messages: list[Message]) -> Path:
-    store = get_typestore(Stores.ROS1_NOETIC)
+    store: Any = get_typestore(Stores.ROS1_NOETIC)
     store.register(get_types_from_msg(ros_types.UWB_RANGE_TEXT, ros_types.UWB_RANGE))
-    humble = ros_types.STORE
+    humble: Any = ros_types.STORE
     with Ros1Writer(path) as writer:
         connections = {}
         for message in messages:

@@ -172,7 +172,7 @@ def _check_together(settings: Settings) -> None:
 
 def _numbers(value: Any) -> list[float]:
     """The numbers that a setting holds; flags, text and sections below a section hold none."""
-    if isinstance(value, bool | str) or dataclasses.is_dataclass(value):
+    if isinstance(value, bool | str | RangeLayout):
         return []
     if isinstance(value, dict):
         return list(value.values())
@@ -230,7 +230,7 @@ def _described(hint: Any) -> str:
 
 def _toml(value: Any, hint: Any) -> str:
     """A setting as a TOML value; of a section below a section, what differs from its defaults."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+    if isinstance(value, RangeLayout):
         pairs = [
             (f.name, getattr(value, f.name)) for f in dataclasses.fields(value) if getattr(value, f.name) != f.default
         ]

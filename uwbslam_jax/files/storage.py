@@ -63,9 +63,13 @@ class Part(Protocol):
     path: Path
     channels: dict[int, Channel]
     counts: Counter[int]
-    truncated: str | None
     start: int
     end: int
+
+    @property
+    def truncated(self) -> str | None:
+        """Where and why the file breaks, None where it does not."""
+        ...
 
     def records(self, channels: set[int] | None = None) -> Iterator[RawMessage]:
         """Yields the messages of these channels (all by default) by log time."""
