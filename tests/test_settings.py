@@ -18,11 +18,11 @@ positive = st.floats(1e-6, 1e6)
 finite = st.floats(-1e6, 1e6)
 by_node = st.dictionaries(st.integers(0, 2**32 - 1).map(str), finite, max_size=4)
 # letters, numbers, punctuation and symbols: all printable, none blank
+topic = st.text(st.characters(codec="utf-8", categories=("L", "N", "P", "S")), min_size=1, max_size=12)
 layout = st.one_of(
     st.just(settings.RangeLayout()),
-    st.builds(settings.RangeLayout, type=st.just("A"), target=st.text(), range=st.just("d"), unit=st.just("mm")),
+    st.builds(settings.RangeLayout, type=st.just("A"), target=topic, range=st.just("d"), unit=st.just("mm")),
 )
-topic = st.text(st.characters(codec="utf-8", categories=("L", "N", "P", "S")), min_size=1, max_size=12)
 
 settings_strategy = st.builds(
     Settings,

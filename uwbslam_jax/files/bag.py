@@ -7,6 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import chain
 from operator import attrgetter
 from pathlib import Path
 
@@ -72,15 +73,23 @@ class Bag:
     def records(self, channels: set[int] | None = None) -> Iterator[RawMessage]:
         """Yields the messages of these channels (all by default) by log time, equal ones in the order of the files."""
         streams = [self._of_part(k, part, channels) for k, part in enumerate(self._parts)]
-        return heapq.merge(*streams, key=attrgetter("log_time"))
+        return heapq.merge(*streams, key=attrgetter("log_time")) if len(streams) > 1 else streams[0]
 
     def _of_part(self, k: int, part: Part, channels: set[int] | None) -> Iterator[RawMessage]:
         first = _MOST_CHANNELS * k
         own = None if channels is None else {number - first for number in channels if number // _MOST_CHANNELS == k}
-        for message in part.records(own):
-            if message.data[:4] == ZSTD_MAGIC:
-                message = message._replace(data=unpack_message(message.data))
-            yield message._replace(channel=message.channel + first) if first else message
+        messages = iter(part.records(own))
+        begin = next(messages, None)
+        if begin is None:
+            return
+        packed = begin.data[:4] == ZSTD_MAGIC  # then all are
+        stream = chain((begin,), messages)
+        if not packed and not first:
+            yield from stream
+            return
+        for message in stream:
+            data = unpack_message(message.data) if packed else message.data
+            yield message._replace(channel=message.channel + first, data=data)
 
 
 def files_of(path: Path) -> list[Path]:

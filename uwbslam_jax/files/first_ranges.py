@@ -91,7 +91,7 @@ class FirstRanges:
     def moving(self, metres: float) -> list[tuple[int, int]]:
         """Pairs whose ranges change; metres: of the ranges' unit."""
         least = max(_MOVED_M, _MOVED_NOISES * self.noise() * metres)
-        return [pair for pair, v in self.pairs.items() if np.ptp(np.quantile(v, (0.05, 0.95))) * metres > least]
+        return [pair for pair, ranges in self.pairs.items() if _spread(ranges) * metres > least]
 
     def robot(self, robot_id: int, metres: float) -> int | None:
         """The node other than this one that is the robot's by its motion, None where none is."""
@@ -113,6 +113,12 @@ class FirstRanges:
         """Whether there is no doubt that a node may be the robot's: it is part of every pair, or of several."""
         own = [pair for pair in self.pairs if node in pair]
         return len(own) > 1 or (len(own) == 1 and len(self.pairs) == 1)
+
+
+def _spread(ranges: list[float]) -> float:
+    """What nine tenths of some ranges spread over [their unit]."""
+    ranges, cut = sorted(ranges), len(ranges) // 20
+    return ranges[-1 - cut] - ranges[cut]
 
 
 def look_ahead(recording: Bag, decoders: Mapping[int, Decoder], options: Options, *, scans: bool) -> None:
