@@ -19,6 +19,10 @@ finite = st.floats(-1e6, 1e6)
 by_node = st.dictionaries(st.integers(0, 2**32 - 1).map(str), finite, max_size=4)
 # letters, numbers, punctuation and symbols: all printable, none blank
 topic = st.text(st.characters(codec="utf-8", categories=("L", "N", "P", "S")), min_size=1, max_size=12)
+layout = st.one_of(
+    st.just(settings.RangeLayout()),
+    st.builds(settings.RangeLayout, type=st.just("A"), target=topic, range=st.just("d"), unit=st.just("mm")),
+)
 
 settings_strategy = st.builds(
     Settings,
@@ -31,6 +35,8 @@ settings_strategy = st.builds(
         max_beacons=st.integers(1, 200),
         height=by_node,
         bias=by_node,
+        unit=st.sampled_from(["auto", "m", "cm", "mm"]),
+        message=layout,
     ),
     lidar=st.builds(settings.LidarSettings, topic, st.floats(0, 1), st.floats(1.1, 100), st.integers(1, 5000)),
     odom=st.builds(settings.OdomSettings, topic, st.booleans(), positive, positive, st.tuples(positive, positive)),
@@ -77,6 +83,13 @@ def test_the_design_example_loads(tmp_path: Path) -> None:
         ({"uwb": {"max_beacons": 8.0}}, "uwb.max_beacons = 8.0: must be an integer"),
         ({"odom": {"use": 1}}, "odom.use = 1: must be true or false"),
         ({"robot": {"antenna": [1, 2]}}, "robot.antenna = [1, 2]: must be a list of 3 numbers"),
+        ({"uwb": {"unit": "km"}}, "uwb.unit = 'km': must be 'auto' or 'm' or 'cm' or 'mm'"),
+        ({"uwb": {"message": 1}}, "uwb.message = 1: must be a section with keys below it"),
+        ({"uwb": {"message": {"ranges": "d"}}}, "unknown key uwb.message.ranges, did you mean uwb.message.range?"),
+        (
+            {"uwb": {"message": {"type": "A"}}},
+            "uwb.message: needs type, the name of the message's type, and range, the path of the range",
+        ),
         ({"uwb": {"bias": [1]}}, 'uwb.bias = [1]: must be a table of numbers by node id, as {"1" = 0.5}'),
         ({"filter": {"preset": "fast"}}, "filter.preset = 'fast': must be 'robust' or 'paper'"),
         ({"uwb": {"bias": {"x": 1.0}}}, 'uwb.bias has the key "x": must be a node id, an unsigned 32-bit integer'),

@@ -108,7 +108,7 @@ def read(path: Paths, settings: Settings | None = None) -> LogReader:
         odom_topic=s.odom.topic if s.odom.use else None,
         scan_frame=s.lidar.frame,
         robot_id=s.robot.id,
-        max_range=s.uwb.max_range,
+        uwb=s.uwb,
     )
 
 
@@ -116,7 +116,7 @@ def inspect(path: Paths, settings: Settings | None = None) -> LogSummary:
     """Tells what a recording holds: topics, rates, gaps, nodes heard, what is missing; `print` it. Raises LogError."""
     s = settings or Settings()
     topics = {"scan_topic": s.lidar.topic, "uwb_topic": s.uwb.topic, "odom_topic": s.odom.topic}
-    found = inspect_log(path, **topics, scan_frame=s.lidar.frame, robot_id=s.robot.id, max_range=s.uwb.max_range)
+    found = inspect_log(path, **topics, scan_frame=s.lidar.frame, robot_id=s.robot.id, uwb=s.uwb)
     found.problems.extend(mounting.contradictions(mounting.mounted(s, found.mounting), found.mounting))
     return found
 
@@ -379,6 +379,7 @@ def _opened(source: Source, settings: Settings | None) -> tuple[LogReader | Iter
     if isinstance(source, str | Path | Sequence) and not _are_messages(source):
         source = read(cast(Paths, source), settings)
     if isinstance(source, LogReader):
+        settings = dataclasses.replace(settings, robot=dataclasses.replace(settings.robot, id=source.robot_id))
         return source, mounting.mounted(settings, source.mounting)
     if isinstance(source, Simulation) or _are_messages(source):
         return source, settings

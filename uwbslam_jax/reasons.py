@@ -75,7 +75,12 @@ class RangeLost:
     FROM_SELF = Reason(Sensor.RANGE, "from a node to itself", "two radios have one id, or --robot.id is a beacon's")
     STAMP = Reason(Sensor.RANGE, "stamp not after the pair's one before", _CLOCK)
     LATE = Reason(Sensor.RANGE, "arrived too late", "the radio's clock is behind the LiDAR's; uwbslam inspect shows it")
-    NO_SLOT = Reason(Sensor.RANGE, "more beacons than max_beacons", "give a larger --uwb.max-beacons")
+    NO_SLOT = Reason(
+        Sensor.RANGE,
+        "of a node heard too seldom, or more beacons than max_beacons",
+        "ids that come once are bit errors; for more beacons give a larger --uwb.max-beacons",
+    )
+    NOT_VALID = Reason(Sensor.RANGE, "marked as not valid", "the radio itself says that its exchanges failed")
     FRAME_FULL = Reason(Sensor.RANGE, "more than one frame holds", "far more ranges come than scans, or scans are lost")
     MALFORMED = Reason(Sensor.RANGE, "malformed", _BYTES)
     LINE_DAMAGED = Reason(Sensor.RANGE, "damaged", _LINE, of="line")

@@ -6,7 +6,7 @@ it may be a static argument of a jitted function. Params are the differentiable 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
@@ -136,17 +136,44 @@ class RobotSettings:
 
 
 @dataclass(frozen=True)
+class RangeLayout:
+    """Where things stand in a message of another radio, by paths: "distance", "tags[].anchors[].dis".
+
+    A path goes through the same lists as that of the range, or beside them: "anchors[].id", "tag.id", "ids[]".
+    """
+
+    type: str = ""
+    """Name of the message's type, with or without its package, as "UwbFrame"; empty where none is described."""
+    source: str = ""
+    """Path of the node that ranges; the robot's where not given."""
+    target: str = ""
+    """Path of the node that it ranges to, "@index" for the place in the list; where not given, the topic names it."""
+    range: str = ""
+    """Path of the range."""
+    unit: Literal["m", "cm", "mm"] = "m"
+    """Unit of the range."""
+    stamp: str = ""
+    """Path of the time: a ROS time, a float of seconds or an integer of nanoseconds; the header's where not given."""
+    receive_power: str = ""
+    """Path of the receive power [dBm]."""
+    first_path_power: str = ""
+    """Path of the first-path power [dBm]."""
+
+
+@dataclass(frozen=True)
 class UwbSettings:
     """Ranging."""
 
     topic: str = "/uwb/ranges"
-    """Topic of the ranges."""
+    """Topic of the ranges; with * in it, several that are one radio's, as "/anchor_*/range"."""
+    unit: Literal["auto", "m", "cm", "mm"] = "auto"
+    """Unit of the recorded ranges; auto: what their message says, unless only another one explains them."""
     sigma_n: float = 0.1
     """Standard deviation of a range [m]."""
     nlos_gap_db: float = 10.0
     """A range whose receive power exceeds its first-path power by more than this [dB] is taken as NLOS and ignored."""
     max_beacons: int = 8
-    """Slots for beacons; ids beyond are counted and ignored."""
+    """Slots for beacons to begin with; where more are heard, room is made in the run, which compiles anew."""
     max_range: float = 200.0
     """Longer ranges are dropped and counted [m]."""
     height: dict[str, float] = field(default_factory=dict)
@@ -157,6 +184,8 @@ class UwbSettings:
     """Part of a range's bias that grows with the distance [m/m]: range = (1 + bias_scale) * distance + both biases."""
     fit_offset: bool = False
     """Whether the relative geometry of nodes at rest has a bias common to all ranges as an unknown."""
+    message: RangeLayout = field(default_factory=RangeLayout)
+    """Where things stand in a message that is not known, section [uwb.message]."""
 
 
 @dataclass(frozen=True)
@@ -247,6 +276,18 @@ class Settings:
     odom: OdomSettings = field(default_factory=OdomSettings)
     map: MapSettings = field(default_factory=MapSettings)
     filter: FilterSettings = field(default_factory=FilterSettings)
+
+
+MOST_BEACONS = 200
+"""Of more beacons a step's covariance alone takes megabytes and seconds [beacons]."""
+
+
+def with_room(settings: Settings, beacons: int) -> Settings:
+    """Settings with slots for so many beacons: uwb.max_beacons is doubled as often as it takes, to MOST_BEACONS."""
+    room = settings.uwb.max_beacons
+    while room < min(beacons, MOST_BEACONS):
+        room = min(2 * room, MOST_BEACONS)
+    return replace(settings, uwb=replace(settings.uwb, max_beacons=room))
 
 
 def make_config(settings: Settings) -> Config:

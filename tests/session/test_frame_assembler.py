@@ -129,14 +129,48 @@ def test_a_node_that_ranges_to_itself_is_dropped_and_counted():
     assert make.dropped == {"range: a node to itself": 1}
 
 
-def test_ids_beyond_max_beacons_are_dropped_and_counted_and_told_once():
+def test_beacons_beyond_max_beacons_get_room_once_they_are_heard_often():
     make = assembler()
-    heard = [ranged(0.0, 0, 4_000_000_000), ranged(0.01, 0, 5), ranged(0.02, 0, 6), ranged(0.03, 0, 7), scan(0.1)]
-    frames = list(make.frames(heard))
-    assert len(taken(frames)) == 2
-    assert make.slots == {0: 0, 4_000_000_000: 1, 5: 2}
-    assert make.dropped == {"range: more beacons than max_beacons": 2}
-    assert make.warnings == ["node 6 is ignored: more than 2 beacons, see uwb.max_beacons"]  # told once
+    heard = [ranged(0.0, 0, 4_000_000_000), ranged(0.01, 0, 5), *(ranged(0.02 + k / 100, 0, 6) for k in range(6))]
+    frames = list(make.frames([*heard, ranged(0.09, 0, 9), scan(0.1), ranged(0.15, 5, 6), scan(0.2)]))
+    assert len(taken(frames)) == 2 + 2 + 1 + 1  # the last two of node 6; node 9 has room now
+    assert make.slots == {0: 0, 4_000_000_000: 1, 5: 2, 6: 3, 9: 4}
+    assert make.dropped == {"range: of a node heard too seldom, or more beacons than max_beacons": 4}
+    assert make.warnings == [
+        "more than 2 beacons were heard: room was made for 4 in the run, --uwb.max-beacons 4 makes it before"
+    ]
+    assert frames[-1].frame.ranges.i.shape == (32,)
+
+
+def test_ids_that_are_heard_once_get_no_more_slots_than_there_are():
+    make = assembler()
+    junk = [ranged(0.001 * k, 0, 1000 + k) for k in range(50)]
+    list(make.frames([*junk, scan(0.1)]))
+    assert len(make.slots) == 3
+    assert make.warnings == []
+
+
+def test_a_robot_that_is_not_heard_is_told():
+    make = assembler()
+    list(make.frames([ranged(0.0, 5, 27), *(ranged(0.01 + k / 100, 6, 27) for k in range(6)), scan(0.1)]))
+    assert make.missing() == [
+        "robot.id = 0 is never heard among the nodes 5, 6, 27: name the robot's own, --robot.id ID"
+    ]
+    list(make.frames([ranged(0.2, 0, 5), scan(0.3)]))
+    assert make.missing() == []
+    without_scans = assembler()
+    list(without_scans.frames([ranged(0.0, 5, 27), ranged(0.01, 5, 28)]))
+    assert without_scans.missing() == []
+
+
+def test_there_is_an_end_to_room(monkeypatch):
+    monkeypatch.setattr("uwbslam_jax.settings.MOST_BEACONS", 3)
+    make = assembler()
+    heard = [ranged(0.01 * k + 0.001 * node, 0, node) for k in range(9) for node in range(1, 7)]
+    list(make.frames([*heard, scan(0.2)]))
+    assert len(make.slots) == 4
+    told = "more than 3 beacons were heard: node {} is ignored, there is room for no more"
+    assert make.warnings[1:] == [told.format(node) for node in range(1, 7) if node not in make.slots]
 
 
 def test_more_ranges_than_a_frame_holds_make_more_frames_or_are_counted():

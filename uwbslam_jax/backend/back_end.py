@@ -44,12 +44,12 @@ class BackEnd:
     """The run so far as a whole.
 
     Attributes:
-      graph: what the run is solved from. taken_over: how often the state was corrected.
+      settings: what the run goes by. graph: what it is solved from. taken_over: how often the state was corrected.
       hindsight: the solution once the run is over, else None.
     """
 
     def __init__(self, settings: Settings):
-        self._settings = settings
+        self.settings = settings
         self.graph = Graph()
         self.hindsight: Hindsight | None = None
         self.taken_over = 0
@@ -109,7 +109,7 @@ class BackEnd:
         if question is not None:
             question = question._replace(graph=self.graph.copy())
             epoch = float(view.state.map_spread.way)
-            self._reviser.begin(view.config, self._params(view), question, self._settings.map.resolution, epoch)
+            self._reviser.begin(view.config, self._params(view), question, self.settings.map.resolution, epoch)
 
     def _question(self, view: HostView) -> Question | None:
         """What to solve of the run so far. Its graph is the one that grows."""
@@ -121,11 +121,11 @@ class BackEnd:
             self.graph.ranges.node(slot): positions[slot] for slot in map(int, np.flatnonzero(resting)) if slot > 0
         }
         poses = view.poses[self.graph.keyframes["frame"]].astype(float)
-        configured = make_host_params(self._settings, make_params(self._settings, dict(view.slots)))
+        configured = make_host_params(self.settings, make_params(self.settings, dict(view.slots)))
         return Question(self.graph, poses, places, configured, self._frame_nodes, bool(view.bias))
 
     def _params(self, view: HostView, bias: dict[int, float] | None = None) -> Params:
-        return make_params(self._settings, dict(view.slots), dict(view.bias if bias is None else bias))
+        return make_params(self.settings, dict(view.slots), dict(view.bias if bias is None else bias))
 
     def _take_over(self, view: HostView, revision: Revision) -> Changes:
         """The state as a revision has it."""
@@ -140,7 +140,7 @@ class BackEnd:
         """Biases that were found, None for none, and whether that is news."""
         if not solution.biased:
             return None, []
-        sigma_n = self._settings.uwb.sigma_n
+        sigma_n = self.settings.uwb.sigma_n
         news = notable(solution.bias, sigma_n) and not notable(view.bias, sigma_n)
         return solution.bias, [SlotEvent(0, EventKind.BIASED)] if news else []
 
@@ -154,6 +154,6 @@ class BackEnd:
         solution = self.hindsight.solution
         bias, _ = self._biases(view, solution)
         params = self._params(view, bias)
-        tiles = Tiles(self._settings.map.resolution)
+        tiles = Tiles(self.settings.map.resolution)
         grid = redraw(view.config, params, tiles, self.graph.seen(solution.poses), self.hindsight.track[-1, :2])
         return self._take_over(view, Revision(solution, grid, tiles))

@@ -19,6 +19,7 @@ from uwbslam_jax.estimator.state import (
     init as init,
     map_pose as map_pose,
     sight as sight,
+    widened as widened,
 )
 from uwbslam_jax.estimator.step import step as step
 from uwbslam_jax.settings import (

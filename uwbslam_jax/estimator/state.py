@@ -120,6 +120,21 @@ def init(config: Config) -> State:
     )
 
 
+def widened(state: State, config: Config) -> State:
+    """The state with the slots of a larger configuration, the new ones not in use."""
+    old, wide = state.active.shape[0], init(config)
+    k = config.nodes
+    at = np.concatenate([np.arange(2 * old), 2 * k + np.arange(2 * old), 4 * k + np.arange(5)])  # see state_vector
+    mean, cov = wide.belief.mean.at[at].set(state.belief.mean), wide.belief.cov.at[np.ix_(at, at)].set(state.belief.cov)
+    grown = (new.at[:old, :old].set(leaf) for new, leaf in zip(wide.scatter, state.scatter, strict=True))
+    return state._replace(
+        belief=Gaussian(mean, cov),
+        active=wide.active.at[:old].set(state.active),
+        moving=wide.moving.at[:old].set(state.moving),
+        scatter=ranging.Scatter(*grown),
+    )
+
+
 def map_pose(estimate: Estimate) -> np.ndarray:
     """(3,) where the map has the robot: the match, or what was expected of it where nothing matched [m, m, rad]."""
     if np.any(estimate.information):

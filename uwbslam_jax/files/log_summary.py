@@ -8,11 +8,13 @@ from dataclasses import dataclass, field
 
 from uwbslam_jax.errors import LogError
 from uwbslam_jax.files.bag import Bag, Source
+from uwbslam_jax.files.first_ranges import look_ahead
 from uwbslam_jax.files.mcap_log import choose_topics, look_first
 from uwbslam_jax.files.mounting import Mounting, read_mounting
-from uwbslam_jax.files.scan_messages import ScanReader
-from uwbslam_jax.files.schemas import Decoder, Options, Role
+from uwbslam_jax.files.range_messages import Options, names_told
+from uwbslam_jax.files.schemas import Decoder, Role
 from uwbslam_jax.measurements import Message, RangeMessage, ScanMessage
+from uwbslam_jax.settings import UwbSettings
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,14 +107,14 @@ def inspect_log(
     odom_topic: str | None = "/odom",
     scan_frame: str = "",
     robot_id: int = 0,
-    max_range: float = 200.0,
+    uwb: UwbSettings | None = None,
 ) -> LogSummary:
     """Reads a recording through and says what it holds; arguments as for `LogReader`.
 
     Raises:
       LogError: the file cannot be read at all. Missing or ambiguous topics are `problems` of the summary.
     """
-    recording, options = Bag(source), Options(robot_id, max_range, ScanReader(scan_frame))
+    recording, options = Bag(source), Options.of(uwb or UwbSettings(), robot_id, scan_frame)
     decoders: dict[int, Decoder] = {}
     roles: dict[int, Role] = {}
     problems: list[str] = []
@@ -126,6 +128,8 @@ def inspect_log(
         except LogError as error:
             problems.append(str(error))
     look_first(recording, decoders, roles, options)
+    ranges = {number: decode for number, decode in decoders.items() if roles[number] == "uwb"}
+    look_ahead(recording, ranges, options, scans=bool({"scan", "odom"} & set(roles.values())))
     topic_of = {channel.id: channel.topic for channel in recording.channels.values()}
     clocks = {topic: _Clock() for topic in topic_of.values()}
     heard = _Heard()
@@ -146,7 +150,7 @@ def inspect_log(
         ground_truth="truth" in roles.values(),
         beams=heard.beams,
         dropped=options.dropped,
-        problems=[*problems, *options.scans.told.values(), *options.told.values()],
+        problems=[*problems, *options.scans.told.values(), *options.told, *names_told(options)],
         mounting=read_mounting(recording, roles, options.scans.frame),
         truncated=recording.truncated,
     )

@@ -144,9 +144,7 @@ class Recording:
             raise LogError(f"{self.path}: the file is empty")
         if head.startswith(MAGIC):
             return
-        known = {b"#ROSBAG": "a ROS 1 bag", b"SQLite format 3": "a ROS 2 bag in SQLite storage"}
-        found = next((f"{name}: convert it to MCAP" for magic, name in known.items() if head.startswith(magic)), None)
-        raise LogError(f"{self.path}: not an MCAP file{f' but {found}' if found else ''}")
+        raise LogError(f"{self.path}: not an MCAP file")
 
     def _walk(self, file: BinaryIO) -> tuple[list[_Block], int | None]:
         """Record by record through the file; returns the blocks and the byte where it breaks, None if it ends well."""

@@ -9,6 +9,7 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Iterator
+from fnmatch import fnmatchcase
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
@@ -17,13 +18,24 @@ from types import TracebackType
 from uwbslam_jax.errors import LogError as LogError
 from uwbslam_jax.evaluation import Truth
 from uwbslam_jax.files.bag import Bag, Source
+from uwbslam_jax.files.first_ranges import look_ahead
 from uwbslam_jax.files.mcap_container import Channel, RecordWriter
 from uwbslam_jax.files.mounting import Mounting, read_mounting
 from uwbslam_jax.files.pose_messages import odometry_parts
+from uwbslam_jax.files.range_messages import Options, names_told
 from uwbslam_jax.files.ros_types import definition, encode
-from uwbslam_jax.files.scan_messages import FIRST_LOOK, ScanReader
-from uwbslam_jax.files.schemas import Decoder, Options, Role, make_decoder, plausible, unpacker
+from uwbslam_jax.files.scan_messages import FIRST_LOOK
+from uwbslam_jax.files.schemas import (
+    Decoder,
+    Role,
+    make_decoder,
+    names_no_node,
+    of_a_radio,
+    plausible,
+    unpacker,
+)
 from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, ScanMessage, TruthMessage
+from uwbslam_jax.settings import UwbSettings
 
 TRUTH_ROBOT, TRUTH_BEACON = "/ground_truth/robot", "/ground_truth/beacon/"
 """Topics of the ground truth, of a beacon without its id [topic]: none is taken for a sensor's."""
@@ -39,6 +51,7 @@ class LogReader:
     Attributes:
       name: what messages call it.
       topics: topic -> role ("scan", "uwb", "odom", "truth") of the topics used.
+      robot_id: id of the robot's node: the one given, or another that the ranges tell it is.
       warnings: what a user should know, one line each; some show only while iterating.
       dropped: messages left out so far, by reason; of the current iteration.
       truncated: where the recording breaks, None where it does not; a corrupt chunk shows only while iterating.
@@ -55,7 +68,7 @@ class LogReader:
         odom_topic: str | None = "/odom",
         scan_frame: str = "",
         robot_id: int = 0,
-        max_range: float = 200.0,
+        uwb: UwbSettings | None = None,
     ):
         """Opens a recording and chooses its topics: those named, else the only one of a fitting type.
 
@@ -64,14 +77,14 @@ class LogReader:
           scan_topic, uwb_topic, odom_topic: where to look first; None leaves that sensor out.
           scan_frame: frame_id of the scanner to use where a topic carries several; "" for the one with most scans.
           robot_id: id of the robot's node, for range messages that name only the other one.
-          max_range: longer ranges are dropped and counted [m].
+          uwb: unit, greatest range and layout of the ranges; the defaults where not given.
 
         Raises:
           LogError: the file cannot be read, has neither scans nor odometry nor ranges, leaves a choice open, or a named
             topic holds something else.
         """
         self._recording = Bag(source)
-        self._options = Options(robot_id, max_range, ScanReader(scan_frame))
+        self._options = Options.of(uwb or UwbSettings(), robot_id, scan_frame)
         self.name = self._recording.name
         wanted: dict[Role, str | None] = {"scan": scan_topic, "uwb": uwb_topic, "odom": odom_topic}
         try:
@@ -88,13 +101,20 @@ class LogReader:
         self._warnings: list[str] = []
         if uwb_topic is not None and "uwb" not in self._roles.values():
             self._warnings.append(f"no UWB topic: {'LiDAR' if 'scan' in self._roles.values() else 'odometry'} only")
+        ranges = {number: decode for number, decode in self._decoders.items() if self._roles[number] == "uwb"}
+        look_ahead(self._recording, ranges, self._options, scans=bool({"scan", "odom"} & set(self._roles.values())))
         self.duration = (self._recording.end - self._recording.start) * 1e-9
         counts = self._recording.counts
         self.message_count = sum(counts[number] for number in self._roles)
 
     @property
     def warnings(self) -> list[str]:
-        return [*self._warnings, *self._options.scans.told.values(), *self._options.told.values()]
+        options = self._options
+        return [*self._warnings, *options.scans.told.values(), *options.told, *names_told(options)]
+
+    @property
+    def robot_id(self) -> int:
+        return self._options.robot_id
 
     @property
     def dropped(self) -> Counter[str]:
@@ -136,8 +156,9 @@ def choose_topics(
     for role, topic in wanted.items():
         if topic is None:
             continue
-        chosen = [channel for channel in recording.channels.values() if channel.topic == topic]
+        chosen = [channel for channel in recording.channels.values() if fnmatchcase(channel.topic, topic)]
         if chosen:
+            options.joined = sorted({channel.topic for channel in chosen}) if role == "uwb" else options.joined
             found = {channel.id: make_decoder(channel, role, options) for channel in chosen}
         else:
             found = _discover(recording, role, options)
@@ -159,27 +180,56 @@ def look_first(recording: Bag, decoders: dict[int, Decoder], roles: dict[int, Ro
 
 
 def _discover(recording: Bag, role: Role, options: Options) -> dict[int, Decoder]:
-    """The channels of the only topic whose type fits the role; empty where none does. Raises LogError for several."""
-    found: dict[int, Decoder] = {}
+    """The channels of the only topic whose type fits the role; empty where none does. Raises LogError for several.
+
+    Of ranges: also those of all topics that have one node's each.
+    """
+    found: dict[int, tuple[int, Decoder]] = {}
+    joined: list[Channel] = []
+    unread: list[str] = []
     for channel in recording.channels.values():
-        if plausible(channel, role) and not channel.topic.startswith("/ground_truth"):
-            try:
-                found[channel.id] = make_decoder(channel, role, options)
-            except LogError:
-                continue  # the name fits, the content does not: not a candidate
-    spoken = {number: decoder for number, decoder in found.items() if recording.counts[number]}
-    found = spoken or found  # a topic without a message is no rival to one with
-    if not found and role == "odom":
-        return _odometry_in_transforms(recording, options)
-    topics = sorted({recording.channels[number].topic for number in found})
+        rank = plausible(channel, role, options)
+        if rank is None or channel.topic.startswith("/ground_truth"):
+            continue
+        try:
+            decoder = make_decoder(channel, role, options)
+            if role == "uwb" and names_no_node(channel, options):
+                joined += [channel] * (recording.counts[channel.id] > 0)
+            else:
+                found[channel.id] = rank, decoder
+        except LogError as error:  # the name fits, the content does not: not a candidate
+            unread += [str(error)] * (recording.counts[channel.id] > 0)
+    # a topic without a message is no rival to one with, nor one whose name says less
+    spoken = {number: each for number, each in found.items() if recording.counts[number]} or found
+    best = min((rank for rank, _ in spoken.values()), default=0)
+    fitting = {number: decoder for number, (rank, decoder) in spoken.items() if rank == best}
+    topics = sorted({recording.channels[number].topic for number in fitting})
     if len(topics) > 1:
         raise LogError(f"several {role} topics: {', '.join(topics)}; choose with --{_KEYS[role]} TOPIC")
-    return found
+    if not fitting and role == "odom":
+        return _odometry_in_transforms(recording, options)
+    if not fitting:
+        fitting = _of_one_radio(joined, unread, options)
+        options.told += unread if role == "uwb" and not fitting else []
+    return fitting
+
+
+def _of_one_radio(joined: list[Channel], unread: list[str], options: Options) -> dict[int, Decoder]:
+    """Decoders of the topics that have one node's ranges each, if they are a radio's; else told in unread."""
+    ours = [channel for channel in joined if of_a_radio(channel)] or (joined if options.message.type else [])
+    options.joined = sorted({channel.topic for channel in ours})
+    if joined and not ours:
+        names = ", ".join(sorted({channel.topic for channel in joined}))
+        unread.append(
+            f"ranges to no named node on {names} are not taken for a radio's: if they are, "
+            "--uwb.topic names them, with * for several"
+        )
+    return {channel.id: make_decoder(channel, "uwb", options) for channel in ours}
 
 
 def _odometry_in_transforms(recording: Bag, options: Options) -> dict[int, Decoder]:
     """The channels of transforms that lead from odom to the robot; empty where none does."""
-    channels = [channel for channel in recording.channels.values() if plausible(channel, "tf")]
+    channels = [channel for channel in recording.channels.values() if plausible(channel, "tf", options) is not None]
     moving = [channel for channel in channels if recording.counts[channel.id] and not channel.topic.endswith("_static")]
     unpack = {channel.id: unpacker(channel, "tf") for channel in moving}
     found: set[int] = set()

@@ -13,6 +13,7 @@ import numpy as np
 
 from uwbslam_jax.files.bag import Bag
 from uwbslam_jax.files.pose_messages import Transform, is_base, is_world, odometry_parts, transforms
+from uwbslam_jax.files.range_messages import Options
 from uwbslam_jax.files.scan_messages import frame_of
 from uwbslam_jax.files.schemas import Role, plausible, unpacker
 from uwbslam_jax.settings import RobotSettings, Settings
@@ -110,7 +111,7 @@ def read_mounting(recording: Bag, roles: Mapping[int, Role], scan_frame: str | N
     robot, radio = wheels[0].child_frame_id.lstrip("/") if wheels else "", max(radio_frames, default="")
     wanted = [frame for frame in {scan_frame, radio} if frame]
     frames = Frames(robot or None)
-    of_tf = {n: "tf" for n, channel in recording.channels.items() if plausible(channel, "tf")}
+    of_tf = {n: "tf" for n, channel in recording.channels.items() if plausible(channel, "tf", Options()) is not None}
     static = {n for n in of_tf if recording.channels[n].topic.endswith("_static")}
     for numbers, most in ((static, sum(recording.counts[n] for n in static)), (set(of_tf) - static, _REPEATED)):
         missing = any(frames.place(frame) is None for frame in wanted)

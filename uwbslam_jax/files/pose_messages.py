@@ -27,6 +27,13 @@ class Transform(NamedTuple):
     matrix: np.ndarray
 
 
+_NO_ROTATION = (
+    "odometry without an orientation is left out: its quaternion has not the length 1 (never filled in?); see "
+    "the driver, or leave it out with --no-odom"
+)
+"""What a user is told of quaternions without a rotation [text]."""
+
+
 def transforms(message: Any) -> list[Transform]:
     """Those of a TFMessage that are rigid motions."""
     found = []
@@ -47,11 +54,11 @@ def odometry_parts(message: Any) -> list[Any]:
     return [each for each in message.transforms if _leads_to_robot(each)]
 
 
-def take_odometry(message: Any, stamp: int, dropped: Counter[str], told: dict[str, str]) -> list[Message]:
+def take_odometry(message: Any, stamp: int, dropped: Counter[str], told: list[str]) -> list[Message]:
     """The pose of an Odometry or of a transform; none, counted, where it is no pose.
 
     Args:
-      told: what a user should know, by what it is about; added to.
+      told: what a user should know, one line each; added to.
     """
     if hasattr(message, "pose"):
         place, turn = message.pose.pose.position, message.pose.pose.orientation
@@ -62,10 +69,8 @@ def take_odometry(message: Any, stamp: int, dropped: Counter[str], told: dict[st
         dropped[OdometryLost.NOT_FINITE] += 1
     elif not _is_rotation(turn):
         dropped[OdometryLost.NO_ROTATION] += 1
-        told["rotation"] = (
-            "odometry without an orientation is left out: its quaternion has not the length 1 (never filled in?); see "
-            "the driver, or leave it out with --no-odom"
-        )
+        if _NO_ROTATION not in told:
+            told.append(_NO_ROTATION)
     else:
         return [OdometryMessage(stamp, x, y, yaw)]
     return []

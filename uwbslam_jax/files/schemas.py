@@ -6,14 +6,12 @@ choose topics; what is written is `ros_types`.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import json
-import math
 import re
 import struct
-from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any, Literal
 
@@ -24,9 +22,18 @@ from rosbags.typesys.store import Typestore
 from uwbslam_jax.errors import LogError
 from uwbslam_jax.files.mcap_container import Channel
 from uwbslam_jax.files.pose_messages import odometry_parts, take_odometry, take_truth
+from uwbslam_jax.files.range_layouts import (
+    Layout,
+    described,
+    fields_of_object,
+    fields_of_type,
+    find_layout,
+    one_a_topic,
+)
+from uwbslam_jax.files.range_messages import Options, fast_range, range_taker
 from uwbslam_jax.files.ros_types import STORE, UWB_RANGE
-from uwbslam_jax.files.scan_messages import ScanReader, foxglove_protobuf
-from uwbslam_jax.measurements import Message, RangeMessage
+from uwbslam_jax.files.scan_messages import foxglove_protobuf
+from uwbslam_jax.measurements import Message
 from uwbslam_jax.reasons import OdometryLost, RangeLost, ScanLost
 
 Role = Literal["scan", "uwb", "odom", "truth", "tf"]
@@ -34,7 +41,7 @@ Decoder = Callable[[bytes, int], list[Message]]
 
 _NAMES: dict[Role, str] = {
     "scan": r"LaserScan",
-    "uwb": r"UwbRange|LinktrackNodeframe[23]|.*RangeStamped",
+    "uwb": r"(?i).*(uwb|rang(e|ing)|linktrack|dwm|decawave|pozyx|anchor|distance).*",
     "odom": r"Odometry",
     "truth": r"PoseStamped|PointStamped",
     "tf": r"(?i:tfMessage)",
@@ -42,7 +49,7 @@ _NAMES: dict[Role, str] = {
 """What a type is called [role -> regex]; the package does not matter, since vendors have their own."""
 SUPPORTED: dict[Role, str] = {
     "scan": "sensor_msgs/LaserScan, foxglove.LaserScan",
-    "uwb": "UwbRange, LinktrackNodeframe2, LinktrackNodeframe3, RangeStamped",
+    "uwb": "UwbRange, LinkTrack frames, RangeStamped, messages with two ids and a range, or lists of them",
     "odom": "nav_msgs/Odometry, tf2_msgs/TFMessage",
     "truth": "geometry_msgs/PoseStamped, geometry_msgs/PointStamped",
     "tf": "tf2_msgs/TFMessage, tf/tfMessage",
@@ -69,38 +76,36 @@ _FIELDS: dict[Role, dict[str, set[str]]] = {
         "ros": {"angle_min", "angle_increment", "time_increment", "range_min", "range_max", "ranges"},
         "foxglove": {"start_angle", "end_angle", "ranges"},
     },
-    "uwb": {"range": {"source", "target", "range"}, "stamped": {"to_id", "range"}, "linktrack": {"id", "nodes"}},
     "odom": {"odom": {"pose", "child_frame_id"}, "tf": {"transforms"}},
     "truth": {"pose": {"header", "pose"}, "point": {"header", "point"}},
     "tf": {"tf": {"transforms"}},
 }
-"""Layouts that are read, by the fields that they need [role -> layout -> fields]."""
+"""Layouts that are read, by the fields that they need [role -> layout -> fields]; of ranges see `range_layouts`."""
+_RANGES_ONLY = r"UwbRange|LinktrackNodeframe[23]|.*RangeStamped"
+"""Types that are ranges between nodes and nothing else, taken before others that may be [regex]."""
+_RADIO = r"(?i).*(uwb|anchor|beacon|tag|dwm|dw[13]000|decawave|pozyx|linktrack|twr).*"
+"""What the topic or type of a radio's ranges to one node says: sonars have the same messages [regex]."""
 _MALFORMED = (SerdeError, struct.error, AttributeError, TypeError, ValueError, LookupError, ArithmeticError)
 """What decoding damaged bytes raises [exceptions]: rosbags passes on those of struct, numpy and the builtins."""
 
 
-@dataclass
-class Options:
-    """How messages are taken.
-
-    Attributes:
-      robot_id: id of the robot's node, for messages that name only the other one.
-      max_range: longer ranges are dropped [m].
-      scans: reads the scans.
-      dropped: what was left out, by reason.
-      told: what a user should know of the poses, one line each, by what it is about.
-    """
-
-    robot_id: int = 0
-    max_range: float = 200.0
-    scans: ScanReader = field(default_factory=ScanReader)
-    dropped: Counter[str] = field(default_factory=Counter)
-    told: dict[str, str] = field(default_factory=dict)
+def plausible(channel: Channel, role: Role, options: Options) -> int | None:
+    """How well the name of a channel's type suggests that it holds measurements of this role, the best 0; None: no."""
+    if role == "uwb" and _is_described(channel, options):
+        return 0
+    if re.fullmatch(_NAMES[role], _base_name(channel.schema)) is None:
+        return None
+    return 1 if role != "uwb" or re.fullmatch(_RANGES_ONLY, _base_name(channel.schema)) else 2
 
 
-def plausible(channel: Channel, role: Role) -> bool:
-    """Whether the name of a channel's type suggests that it holds measurements of this role."""
-    return re.fullmatch(_NAMES[role], _base_name(channel.schema)) is not None
+def names_no_node(channel: Channel, options: Options) -> bool:
+    """Whether a channel's ranges are to the one node that its topic, or its frame, names."""
+    return channel.encoding in ("cdr", "ros1") and _range_layout(channel, options).target == "@topic"
+
+
+def of_a_radio(channel: Channel) -> bool:
+    """Whether the names of a channel's topic and type suggest a radio."""
+    return re.fullmatch(_RADIO, f"{channel.topic} {channel.schema}") is not None
 
 
 def make_decoder(channel: Channel, role: Role, options: Options) -> Decoder:
@@ -111,14 +116,14 @@ def make_decoder(channel: Channel, role: Role, options: Options) -> Decoder:
     Raises:
       LogError: the type or encoding is not one we read; the message names both.
     """
+    if role == "uwb":
+        return _range_decoder(channel, options)
     unpack, fields = _unpacker(channel, role)
     layouts = [name for name, wanted in _FIELDS[role].items() if fields is None or wanted <= fields]
     if not layouts:
         raise LogError(
             f"topic {channel.topic}: schema {channel.schema!r} holds no {_WORDS[role]}; supported: {SUPPORTED[role]}"
         )
-    if _is_our_range(channel):
-        return _fast_range(options)
     take, malformed = _TAKE[role], _MALFORMED_AS[role]
 
     def decode(data: bytes, log_time: int) -> list[Message]:
@@ -147,6 +152,60 @@ def unpacker(channel: Channel, role: Role) -> Callable[[bytes], Any]:
     return read
 
 
+def _is_described(channel: Channel, options: Options) -> bool:
+    wanted, own = (name.replace("/msg/", "/") for name in (options.message.type, channel.schema))
+    return bool(wanted) and wanted in (own, _base_name(own))
+
+
+def _range_layout(channel: Channel, options: Options) -> Layout:
+    """The layout of a channel with a definition: the user's, or one that is told by the fields. Raises LogError."""
+    store, name = _store_of(dataclasses.replace(channel, id=0))
+    fields = fields_of_type(store.fielddefs, name)
+    if _is_described(channel, options):
+        layout = described(options.message)
+        paths = layout.source, layout.target, layout.range, layout.stamp, *layout.powers
+        absent = [
+            path
+            for path in paths
+            if path and path[0] != "@" and not any(f"{f}.".startswith(f"{path}.") for f in fields)
+        ]
+        if absent:
+            raise LogError(f"uwb.message: {channel.schema} has no {', '.join(absent)}; it has {', '.join(fields)}")
+        return layout
+    layout = find_layout(fields) or one_a_topic(fields)
+    if layout is None:
+        raise LogError(
+            f"topic {channel.topic}: schema {channel.schema!r} holds no range that is found by its fields "
+            f"({', '.join(list(fields)[:16])}); supported: {SUPPORTED['uwb']}; or describe it in [uwb.message]"
+        )
+    return layout
+
+
+def _range_decoder(channel: Channel, options: Options) -> Decoder:
+    """Decoder of a channel of ranges; the layout of one without a definition is found with its first message."""
+    unpack, fields = _unpacker(channel, "uwb")
+    if fields is not None and _is_our_range(channel):
+        return fast_range(options)
+    layout = described(options.message) if _is_described(channel, options) else None
+    layout = layout if fields is None else _range_layout(channel, options)
+    take = range_taker(layout, channel.topic, options) if layout else None
+
+    def decode(data: bytes, log_time: int) -> list[Message]:
+        nonlocal take
+        try:
+            message = unpack(data)
+            if take is None and (found := find_layout(fields_of_object(message))):
+                take = range_taker(found, channel.topic, options)
+            if take is not None:
+                return take(message, log_time, _stamp)
+        except _MALFORMED:
+            pass
+        options.dropped[RangeLost.MALFORMED] += 1
+        return []
+
+    return decode
+
+
 def _base_name(schema: str) -> str:
     return re.split(r"[/.]", schema)[-1]
 
@@ -154,11 +213,11 @@ def _base_name(schema: str) -> str:
 def _unpacker(channel: Channel, role: Role) -> tuple[Callable[[bytes], Any], set[str] | None]:
     """From bytes to an object with the message's fields, and the names of these where there is a definition."""
     if channel.encoding in ("cdr", "ros1"):
-        store, name = _store_of(channel)
+        store, name = _store_of(dataclasses.replace(channel, id=0))
         fields = {field_name for field_name, _ in store.fielddefs[name][1]}
         decode = store.deserialize_cdr if channel.encoding == "cdr" else store.deserialize_ros1
         return (lambda data: decode(data, name)), fields
-    if channel.encoding == "json" and plausible(channel, role):
+    if channel.encoding == "json" and (role == "uwb" or plausible(channel, role, Options())):
         return (lambda data: json.loads(data, object_hook=lambda d: SimpleNamespace(**d))), None
     if channel.encoding == "protobuf" and role == "scan" and channel.schema == "foxglove.LaserScan":
         return foxglove_protobuf, None
@@ -199,42 +258,9 @@ def _is_our_range(channel: Channel) -> bool:
     """Whether a channel holds CDR messages laid out exactly as UwbRange, whatever their name."""
     if channel.encoding != "cdr":
         return False
-    store, name = _store_of(channel)
+    store, name = _store_of(dataclasses.replace(channel, id=0))
     pairs = [(name, UWB_RANGE)] + [(t, t) for t in ("std_msgs/msg/Header", "builtin_interfaces/msg/Time")]
     return all(t in store.fielddefs and store.fielddefs[t][1] == STORE.fielddefs[own][1] for t, own in pairs)
-
-
-def _fast_range(options: Options) -> Decoder:
-    """Decoder of UwbRange without the generic machinery: recordings hold hundreds of them a second."""
-    heads = [struct.Struct(order + "iII") for order in "><"]
-    tails = [struct.Struct(order + "IIfff") for order in "><"]
-
-    def decode(data: bytes, log_time: int) -> list[Message]:
-        try:
-            if data[0] or data[1] > 1:
-                raise ValueError("not plain CDR")
-            sec, nanosec, length = heads[data[1]].unpack_from(data, 4)
-            source, target, *values = tails[data[1]].unpack_from(data, 16 + (length + 3 & ~3))
-            stamp = sec * 1_000_000_000 + nanosec or log_time
-        except (struct.error, IndexError, ValueError):
-            options.dropped[RangeLost.MALFORMED] += 1
-            return []
-        return _checked(RangeMessage(stamp, source, target, *values), options)
-
-    return decode
-
-
-def _checked(found: RangeMessage, options: Options) -> list[Message]:
-    """The one range as a list, empty and counted where it cannot be a distance between two nodes."""
-    if not 0.0 < found.range < math.inf:
-        options.dropped[RangeLost.NOT_POSITIVE] += 1
-    elif found.range > options.max_range:
-        options.dropped[RangeLost.over(options.max_range)] += 1
-    elif found.source == found.target:
-        options.dropped[RangeLost.FROM_SELF] += 1
-    else:
-        return [found]
-    return []
 
 
 def _stamp(message: Any, log_time: int) -> int:
@@ -247,30 +273,8 @@ def _stamp(message: Any, log_time: int) -> int:
     return int(time.sec) * 1_000_000_000 + int(time.nsec if nanosec is None else nanosec) or log_time
 
 
-def _take_ranges(message: Any, log_time: int, options: Options) -> list[Message]:
-    stamp = _stamp(message, log_time)
-    if hasattr(message, "nodes"):
-        found: list[Message] = []
-        for node in message.nodes:
-            measured = float(node.dis), float(node.rx_rssi), float(node.fp_rssi)
-            found += _checked(RangeMessage(stamp, int(message.id), _linktrack_id(message, node), *measured), options)
-        return found
-    if hasattr(message, "to_id"):
-        source = int(getattr(message, "from_id", options.robot_id))
-        return _checked(RangeMessage(stamp, source, int(message.to_id), float(message.range)), options)
-    powers = [float(getattr(message, name, math.nan)) for name in ("receive_power", "first_path_power")]
-    nodes = int(message.source), int(message.target)
-    return _checked(RangeMessage(stamp, *nodes, float(message.range), *powers), options)
-
-
-def _linktrack_id(frame: Any, node: Any) -> int:
-    """Id of a LinkTrack node. Tags and anchors count apart: one that shares the frame's own id gets role * 256 + id."""
-    return int(node.id) if node.id != frame.id or node.role == frame.role else int(node.role) * 256 + int(node.id)
-
-
 _TAKE: dict[Role, Callable[[Any, int, Options], list[Message]]] = {
     "scan": lambda message, log_time, options: options.scans.take(message, _stamp(message, log_time), options.dropped),
-    "uwb": _take_ranges,
     "odom": lambda message, log_time, options: [
         found
         for part in odometry_parts(message)

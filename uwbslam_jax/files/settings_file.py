@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from uwbslam_jax.errors import ConfigError
-from uwbslam_jax.settings import Settings
+from uwbslam_jax.settings import MOST_BEACONS, RangeLayout, Settings
 
 _MAX_CELLS = 4096
 """Side of the matching window at its finest level [cells]; beyond this the maps alone take gigabytes."""
@@ -34,7 +34,7 @@ _MAY_BE_INFINITE = ["uwb.nlos_gap_db"]
 """Settings whose infinity switches their rule off [keys]."""
 _LIMITS = {
     "robot.id": (0, 2**32 - 1),
-    "uwb.max_beacons": (1, 200),
+    "uwb.max_beacons": (1, MOST_BEACONS),
     "lidar.max_beams": (1, 100_000),
     "map.levels": (1, 5),
     "uwb.bias_scale": (-0.5, 1.0),
@@ -157,6 +157,9 @@ def _check_together(settings: Settings) -> None:
     lidar, window, switches = settings.lidar, settings.map, settings.filter
     if lidar.min_range >= lidar.max_range:
         raise ConfigError(f"lidar.min_range = {lidar.min_range}: must be below lidar.max_range = {lidar.max_range}")
+    message = settings.uwb.message
+    if message != RangeLayout() and not (message.type and message.range):
+        raise ConfigError("uwb.message: needs type, the name of the message's type, and range, the path of the range")
     cells = window.size_m / window.resolution
     coarsest = 2 ** (window.levels - 1)
     if not 8 * coarsest <= cells <= _MAX_CELLS:
@@ -168,8 +171,8 @@ def _check_together(settings: Settings) -> None:
 
 
 def _numbers(value: Any) -> list[float]:
-    """The numbers that a setting holds; flags and text hold none."""
-    if isinstance(value, bool | str):
+    """The numbers that a setting holds; flags, text and sections below a section hold none."""
+    if isinstance(value, bool | str | RangeLayout):
         return []
     if isinstance(value, dict):
         return list(value.values())
@@ -202,6 +205,13 @@ def _typed(name: str, value: Any, hint: Any) -> Any:
         return {str(key): _typed(f"{name}.{key}", item, get_args(hint)[1]) for key, item in value.items()}
     if hint is float and isinstance(value, int | float) and not isinstance(value, bool):
         return float(value)
+    if dataclasses.is_dataclass(hint) and isinstance(hint, type) and isinstance(value, Mapping):
+        hints = get_type_hints(hint)
+        for key in value:
+            if key not in hints:
+                near = difflib.get_close_matches(str(key), hints, 1, cutoff=0.0)
+                raise ConfigError(f"unknown key {name}.{key}, did you mean {name}.{near[0]}?")
+        return hint(**{key: _typed(f"{name}.{key}", item, hints[key]) for key, item in value.items()})
     if isinstance(hint, type) and type(value) is hint:
         return value
     raise ConfigError(f"{name} = {value!r}: must be {_described(hint)}")
@@ -213,11 +223,18 @@ def _described(hint: Any) -> str:
         return f"a list of {len(get_args(hint))} numbers"
     if get_origin(hint) is dict:
         return 'a table of numbers by node id, as {"1" = 0.5}'
+    if dataclasses.is_dataclass(hint):
+        return "a section with keys below it"
     return {float: "a number", int: "an integer", bool: "true or false", str: "text"}.get(hint, str(hint))
 
 
 def _toml(value: Any, hint: Any) -> str:
-    """A setting as a TOML value."""
+    """A setting as a TOML value; of a section below a section, what differs from its defaults."""
+    if isinstance(value, RangeLayout):
+        pairs = [
+            (f.name, getattr(value, f.name)) for f in dataclasses.fields(value) if getattr(value, f.name) != f.default
+        ]
+        return "{" + ", ".join(f"{key} = {_toml(item, str)}" for key, item in pairs) + "}"
     if isinstance(value, dict):
         return "{" + ", ".join(f'"{key}" = {float(number)!r}' for key, number in value.items()) + "}"
     if isinstance(value, tuple):

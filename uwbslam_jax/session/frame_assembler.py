@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 
 import numpy as np
 
@@ -28,13 +28,17 @@ from uwbslam_jax.measurements import (
 from uwbslam_jax.numerics import between, wrapped
 from uwbslam_jax.reasons import OdometryLost, RangeLost, ScanLost, Sensor
 from uwbslam_jax.session.odometry_track import OdometryTrack
-from uwbslam_jax.settings import Settings
+from uwbslam_jax.settings import Settings, make_config, with_room
 
 _SCANLESS_S = 1.0
 """Ranges wait this long for a scan before they make a frame of their own."""
 _BLIND_S, _BLIND_SCANS = 0.2, 2
 """Once a LiDAR has fallen silent they wait only so long, or so many of its usual intervals where those are longer: no
 velocity predicts a turning robot for a second, but a slow scanner is not a silent one."""
+_OFTEN = 5
+"""An id that would need more slots gets one once it was heard so often: single ones are errors of a radio [ranges]."""
+_TELLING_PAIRS = 2
+"""Where so many pairs of nodes were heard and the robot in none, its id may be another [pairs]."""
 _INTERVALS = 9
 """So many intervals between scans tell the usual one."""
 _WITHOUT_SCAN_S = 3.0
@@ -55,7 +59,7 @@ class FrameAssembler:
     Attributes:
       slots: node id -> slot, the robot 0; filled as ids are heard.
       dropped: what was not used, by reason. used: what was, by sensor. blank: scans of these without a return.
-      warnings: one line each; that there are more beacons than slots is told once.
+      warnings: one line each; that there are more beacons than slots is told once for each time.
       wheels: the odometry's poses so far, as one track.
       odometry_used: whether any frame carried an increment.
     """
@@ -70,6 +74,7 @@ class FrameAssembler:
         self.odometry_used = False
         self._settings = settings
         self._max_ranges = max_ranges
+        self._seldom: Counter[int] = Counter()  # ids without a slot
         self._ranges: list[RangeMessage] = []
         self._newest_range: dict[tuple[int, int], int] = {}
         self._odometry: list[OdometryMessage] = []
@@ -96,6 +101,13 @@ class FrameAssembler:
             case TruthMessage():
                 pass
         return []
+
+    def missing(self) -> list[str]:
+        """One line where a robot that drives was not heard so far, though the others were."""
+        pairs, robot = self._newest_range, self._settings.robot.id
+        drives = self._scan_at is not None and len(pairs) >= _TELLING_PAIRS
+        heard = any(robot in pair for pair in pairs)
+        return [robot_unheard(robot, set(self.slots) - {robot})] if drives and not heard else []
 
     def flush(self) -> list[StampedFrame]:
         """Frames of the ranges and the odometry that no scan came for, at the end of a stream."""
@@ -177,14 +189,28 @@ class FrameAssembler:
         return frames
 
     def _slot(self, node: int) -> int | None:
+        """The slot of a node; None for one that there is no slot for, as yet or at all."""
         if node not in self.slots:
             most = self._settings.uwb.max_beacons
             if len(self.slots) > most:
-                if not self.warnings:
-                    self.warnings.append(f"node {node} is ignored: more than {most} beacons, see uwb.max_beacons")
-                return None
+                self._seldom[node] += 1
+                if self._seldom[node] < _OFTEN or not self._make_room(node):
+                    return None
             self.slots[node] = len(self.slots)
         return self.slots[node]
+
+    def _make_room(self, node: int) -> bool:
+        """Whether there are more slots now."""
+        most = self._settings.uwb.max_beacons
+        self._settings = with_room(self._settings, most + 1)
+        self._max_ranges = make_config(self._settings).max_ranges
+        room = self._settings.uwb.max_beacons
+        told = f"more than {most} beacons were heard: "
+        if room > most:
+            self.warnings.append(f"{told}room was made for {room} in the run, --uwb.max-beacons {room} makes it before")
+        elif self._seldom[node] == _OFTEN:
+            self.warnings.append(f"{told}node {node} is ignored, there is room for no more")
+        return room > most
 
     def _without_scan(self, before: int | None) -> list[StampedFrame]:
         """Frames for ranges that have waited: one whenever they span too long or fill a frame."""
@@ -240,6 +266,12 @@ class FrameAssembler:
         increment = between(np.array(a), np.array(b))
         increment[2] = wrapped(increment[2])
         return Odometry(increment.astype(np.float32), np.bool_(True))
+
+
+def robot_unheard(robot_id: int, nodes: Collection[int]) -> str:
+    """Warning that the robot's node is none of those heard."""
+    among = ", ".join(map(str, sorted(nodes)[:12])) + (" ..." if len(nodes) > 12 else "")
+    return f"robot.id = {robot_id} is never heard among the nodes {among}: name the robot's own, --robot.id ID"
 
 
 def _pose_at(track: list[OdometryMessage], stamp: int) -> tuple[float, float, float]:

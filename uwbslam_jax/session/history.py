@@ -138,6 +138,10 @@ class History:
         if frame.frame.has_scan:
             self.last_scan = (number, frame, estimate)
 
+    def make_room(self) -> None:
+        """Steps have more slots from now on."""
+        self._left, self._seen = self.beacons, None
+
     def passage(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Stamps (T,) [ns], map poses (T, 3) in float64 and sight (T,) of all frames."""
         return np.array(self.stamps), np.array(self.map_poses, float), np.array(self.sight)

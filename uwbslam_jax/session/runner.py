@@ -106,7 +106,8 @@ class Runner:
         """
         dropped = facts.dropped + self._assembler.dropped + self.not_located
         wheels = [*self._assembler.wheels.told(), *self.session.odometry.told()]
-        warnings = [*facts.warnings, *self._assembler.warnings, *wheels]
+        own = [*self._assembler.warnings, *self._assembler.missing()]
+        warnings = list(dict.fromkeys([*facts.warnings, *own, *wheels]))
         told = dataclasses.replace(
             facts,
             warnings=warnings,
@@ -143,7 +144,7 @@ class Runner:
 
     def _take(self, frame: StampedFrame) -> list[Update]:
         self._waiting.append(frame)
-        return self._step() if len(self._waiting) == self._group else []
+        return self._step() if len(self._waiting) >= min(self._group, self.session.room()) else []
 
     def _step(self) -> list[Update]:
         frames, self._waiting = self._waiting, []

@@ -15,7 +15,7 @@ import numpy as np
 
 from uwbslam_jax.backend import BackEnd, Graph, Hindsight, notable
 from uwbslam_jax.beacons import MEMORY_S, BeaconKeeper
-from uwbslam_jax.estimator import Changes, Estimate, HostView, compiled, init
+from uwbslam_jax.estimator import Changes, Estimate, HostView, compiled, init, widened
 from uwbslam_jax.mapping import Tiles
 from uwbslam_jax.measurements import Odometry, StampedFrame
 from uwbslam_jax.result import BeaconStatus, EventKind, MapImage, RunStatus
@@ -24,7 +24,7 @@ from uwbslam_jax.session.history import History
 from uwbslam_jax.session.odometry_monitor import OdometryMonitor
 from uwbslam_jax.session.saved_state import Saved
 from uwbslam_jax.session.update import Update
-from uwbslam_jax.settings import HostParams, Params, Settings, make_config, make_host_params, make_params
+from uwbslam_jax.settings import HostParams, Params, Settings, make_config, make_host_params, make_params, with_room
 from uwbslam_jax.startup import StartUp
 
 CONTROL_EVERY = compiled.GROUP
@@ -37,7 +37,8 @@ class Session:
     """A run in progress.
 
     Attributes:
-      settings, config, params: what it runs with; params grow biases and heights as ids get slots.
+      settings, config, params: what it runs with; params grow biases and heights as ids get slots, and all of them
+        slots where there are more beacons than uwb.max_beacons.
       state, tiles: the estimator's, and what of its map lies outside the window.
       decided_at: stamp of the frame at which the published frame was decided, None before [ns].
       status: of the start-up. hypotheses: explanations of the start that are alive.
@@ -122,7 +123,7 @@ class Session:
 
     def steps(self, frames: Sequence[StampedFrame]) -> list[Estimate]:
         """The same for as many frames as there is room for, all at once."""
-        if len(frames) != CONTROL_EVERY or self._pending:
+        if len(frames) != CONTROL_EVERY or self._pending or len(frames[-1].slots) > self.config.nodes:
             return [self.step(frame) for frame in frames]
         frames = [self._admitted(frame) for frame in frames]
         self.state, estimates = compiled.step(self.config, self.params, self.state, [f.frame for f in frames])
@@ -175,6 +176,8 @@ class Session:
 
     def _admitted(self, frame: StampedFrame) -> StampedFrame:
         """A frame about to be stepped: its ids are learnt, odometry that is not trusted is set aside."""
+        if len(frame.slots) > self.config.nodes:
+            self._make_room(len(frame.slots))
         if len(frame.slots) > len(self._slots):
             self._slots = dict(frame.slots)
             self.params = make_params(self.settings, self._slots, self.found_bias)
@@ -183,6 +186,17 @@ class Session:
             return frame
         without = frame.frame._replace(odometry=Odometry(np.zeros(3, np.float32), np.bool_(False)))
         return dataclasses.replace(frame, frame=without)
+
+    def _make_room(self, nodes: int) -> None:
+        """Slots for so many nodes, robot included; what was stepped with fewer is looked at before."""
+        if self._pending:
+            self._look()
+        self.settings = with_room(self.settings, nodes - 1)
+        sizes = make_config(self.settings)
+        self.config = dataclasses.replace(self.config, nodes=sizes.nodes, max_ranges=sizes.max_ranges)
+        self.state = widened(self.state, self.config)
+        self.history.make_room()
+        self.back_end.settings = self.settings
 
     def _take(self, frame: StampedFrame, estimate: Estimate) -> None:
         self.back_end.add(self.host, len(self.history.stamps) + len(self._pending), frame, estimate)

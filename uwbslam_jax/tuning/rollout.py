@@ -24,7 +24,7 @@ from uwbslam_jax.estimator import State, step
 from uwbslam_jax.mapping import EPOCH_LEVEL, TILE, Grid
 from uwbslam_jax.measurements import Frame, Message, RangeMessage, StampedFrame
 from uwbslam_jax.session import CONTROL_EVERY, FrameAssembler, Session, fit_beams
-from uwbslam_jax.settings import Config, Params, Settings
+from uwbslam_jax.settings import MOST_BEACONS, Config, Params, Settings
 
 _SETTLED = 30
 """Frames after start-up has decided that beacons have to be placed which it was not yet sure of."""
@@ -124,7 +124,7 @@ def prepare(messages: Sequence[Message], settings: Settings) -> Rollout:
 def fit_nodes(settings: Settings, messages: Sequence[Message]) -> Settings:
     """Settings with no more slots for beacons than there are ids: a step's cost grows with them."""
     ids = {node for m in messages if isinstance(m, RangeMessage) for node in (m.source, m.target)}
-    beacons = min(max(len(ids - {settings.robot.id}), 1), settings.uwb.max_beacons)
+    beacons = min(max(len(ids - {settings.robot.id}), 1), MOST_BEACONS)
     return dataclasses.replace(settings, uwb=dataclasses.replace(settings.uwb, max_beacons=beacons))
 
 
