@@ -176,7 +176,7 @@ def _fast_range(options: Options) -> Decoder:
                 raise ValueError("not plain CDR")
             sec, nanosec, length = heads[data[1]].unpack_from(data, 4)
             source, target, *values = tails[data[1]].unpack_from(data, 16 + (length + 3 & ~3))
-            stamp = sec * 1_000_000_000 + nanosec or log_time
+            stamp = sec * 1_000_000_000 + nanosec
         except (struct.error, IndexError, ValueError):
             options.dropped["range: malformed"] += 1
             return []
@@ -198,14 +198,14 @@ def _checked(found: RangeMessage, options: Options) -> list[Message]:
     return []
 
 
-def _stamp(message: Any, log_time: int) -> int:
-    """Time of a message [ns]: its header's, or its own, or the log time where it has neither or zero."""
+def _stamp(message: Any) -> int:
+    """Time of a message [ns]: its header's, or its own; 0 where it has neither."""
     time = getattr(message, "header", message)
     time = getattr(time, "stamp", None) or getattr(time, "timestamp", None)
     if time is None:
-        return log_time
+        return 0
     nanosec = getattr(time, "nanosec", None)
-    return int(time.sec) * 1_000_000_000 + int(time.nsec if nanosec is None else nanosec) or log_time
+    return int(time.sec) * 1_000_000_000 + int(time.nsec if nanosec is None else nanosec)
 
 
 def _take_scan(message: Any, log_time: int, options: Options) -> list[Message]:
@@ -223,11 +223,11 @@ def _take_scan(message: Any, log_time: int, options: Options) -> list[Message]:
         limits = (0.0, math.inf)
     if not all(map(math.isfinite, (angle_min, increment, time_increment))) or (increment == 0 and ranges.size > 1):
         raise ValueError("bearings are not finite or all the same")
-    return [ScanMessage(_stamp(message, log_time), angle_min, increment, time_increment, *limits, ranges)]
+    return [ScanMessage(_stamp(message), angle_min, increment, time_increment, *limits, ranges)]
 
 
 def _take_ranges(message: Any, log_time: int, options: Options) -> list[Message]:
-    stamp = _stamp(message, log_time)
+    stamp = _stamp(message)
     if hasattr(message, "nodes"):
         found: list[Message] = []
         for node in message.nodes:
@@ -257,13 +257,13 @@ def _take_odometry(message: Any, log_time: int, options: Options) -> list[Messag
     if not all(map(math.isfinite, (x, y, yaw))):
         options.dropped["odometry: not finite"] += 1
         return []
-    return [OdometryMessage(_stamp(message, log_time), x, y, yaw)]
+    return [OdometryMessage(_stamp(message), x, y, yaw)]
 
 
 def _take_truth(message: Any, log_time: int, options: Options) -> list[Message]:
     """A pose, or the point of a node that the topic names and `mcap_log` fills in."""
     del options
-    stamp = _stamp(message, log_time)
+    stamp = _stamp(message)
     if hasattr(message, "pose"):
         p = message.pose.position
         return [TruthMessage(stamp, None, float(p.x), float(p.y), _yaw(message.pose.orientation))]
