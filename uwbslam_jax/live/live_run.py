@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from array import array
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,8 +23,8 @@ from uwbslam_jax.live.devices import Devices
 from uwbslam_jax.live.message_queue import Inbox
 from uwbslam_jax.live.publisher import Publisher
 from uwbslam_jax.live.recorder import LogRecorder
-from uwbslam_jax.measurements import ScanMessage
-from uwbslam_jax.session import Facts, Saved, Update, saved_state
+from uwbslam_jax.measurements import Message, ScanMessage
+from uwbslam_jax.session import Facts, MessageClocks, Saved, Update, saved_state
 from uwbslam_jax.web import LivePage, Status
 
 _IDLE_S, _STATUS_S, _SAVE_S = 0.05, 0.5, 10.0
@@ -68,6 +68,8 @@ class LiveRun:
         self._recorder = LogRecorder(recording, slam.settings)
         self._queue = Inbox(self._recorder.record)
         self._recorder.tick = lambda: self._queue.thin(host_time())
+        self._clocks = MessageClocks()
+        self._arrived: deque[tuple[np.ndarray, int]] = deque()  # scans on their way through the clocks
         self._scan_received: int | None = None
         self._latency_ms = array("f")
         self._beams: set[int] = set()
@@ -89,7 +91,8 @@ class LiveRun:
             self._devices.close()
             while self._turn(0.0):
                 pass
-            result = self._slam.finish(Facts(dropped=self._dropped()))
+            self._take(self._clocks.flush())
+            result = self._slam.finish(Facts(warnings=self._clocks.warnings, dropped=self._dropped()))
         finally:
             self._devices.close()
             self._recorder.close()
@@ -108,11 +111,23 @@ class LiveRun:
             self._refresh()
         if arrival is None:
             return False
-        if isinstance(arrival.message, ScanMessage):
-            self._scan_received = arrival.received
-            self._beams.add(arrival.message.ranges.size)
-        self._slam.add(arrival.message)
+        message = arrival.message
+        topics = self._slam.settings.uwb.topic, self._slam.settings.lidar.topic
+        if isinstance(message, ScanMessage):
+            self._arrived.append((message.ranges, arrival.received))
+            self._beams.add(message.ranges.size)
+        # with the times and topics of the recording, so that it gives the same again
+        self._take(self._clocks.take(message, arrival.log_time, topics[isinstance(message, ScanMessage)]))
         return True
+
+    def _take(self, timed: list[Message]) -> None:
+        """Messages on one clock go in."""
+        for message in timed:
+            if isinstance(message, ScanMessage):
+                ranges = None
+                while ranges is not message.ranges:  # one that was dropped is passed over
+                    ranges, self._scan_received = self._arrived.popleft()
+            self._slam.add(message)
 
     def _publish(self, update: Update) -> None:
         """Called with each update, before the host looks at what it means for start-up and beacons."""
@@ -133,7 +148,7 @@ class LiveRun:
         self._measured = measured
         recent = np.array(self._latency_ms[-_RECENT:])
         latency = (float(np.median(recent)), float(np.percentile(recent, 99))) if len(recent) else None
-        troubles = self._devices.troubles()
+        troubles = self._devices.troubles() + self._clocks.warnings
         troubles += [f"recording: {self._recorder.failure}"] if self._recorder.failure else []
         self._status = Status(rates, dict(self._dropped() + self._slam.runner.not_located), latency, troubles)
         if now - self._saved_at > _SAVE_S and self._save(wait=False):
@@ -162,7 +177,7 @@ class LiveRun:
         process.give_back()
 
     def _dropped(self) -> Counter[str]:
-        counts: Counter[str] = Counter(self._queue.dropped)
+        counts: Counter[str] = self._queue.dropped + self._clocks.dropped
         for source in self._devices.sources.values():
             counts.update({why: n for why, n in source.counts.items() if why not in _NO_LOSS})
         return counts

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from statistics import median_low
 from typing import NamedTuple
 
 from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, ScanMessage, TruthMessage
+from uwbslam_jax.session.topic_clock import Jump, TopicClock, told_apart, told_jumps, told_pause
 
 _NEAR = 500_000_000
 """A stamp that follows the one before within this, or whose difference to the log time changes by no more, is in no
@@ -39,12 +40,8 @@ _SLOW = 6
 _DRIFT = 0.1
 """A log whose time passes otherwise than the stamps by more than this share tells no pauses [1]: it was written later,
 or the recording played at another speed."""
-_MANY = 0.2
-"""A topic that loses more than this share of its messages is worth a warning [1]."""
 _RECENT = 8
 """So many jumps of other topics may be this one's too [jumps]."""
-_MOST_TOLD = 3
-"""So many jumps of a clock are told one by one [warnings]."""
 _WORDS: dict[type, str] = {ScanMessage: "scan", RangeMessage: "range", OdometryMessage: "odometry"}
 """What drops are counted as [message type -> text]; what is not here is ground truth."""
 _RANK = [ScanMessage, OdometryMessage, RangeMessage, TruthMessage]
@@ -57,7 +54,7 @@ class _Held(NamedTuple):
     message: Message
     stamp: int
     log: int | None
-    own: _Topic
+    own: TopicClock
 
     @property
     def bare(self) -> bool:
@@ -81,41 +78,6 @@ class _Held(NamedTuple):
         return 0 <= step <= _NEAR or abs(other.off - self.off) <= _NEAR
 
 
-@dataclass(slots=True)
-class _Topic:
-    """One topic so far. stamp, log: of its last good message [ns]. shift: what its stamps are moved by. last, usual: of
-    moved stamp less log time [ns]. known: whether one was good. good, bad, bare, twice: messages, those dropped, those
-    without a stamp, those with the stamp of the one before."""
-
-    name: str
-    kind: type
-    stamp: int = 0
-    log: int = 0
-    shift: int = 0
-    last: int = 0
-    usual: int = 0
-    known: bool = False
-    good: int = 0
-    bad: int = 0
-    bare: int = 0
-    twice: int = 0
-
-
-@dataclass(slots=True)
-class _Jump:
-    """A clock was set. change: of the shift [ns]. after: time since the first message [ns]. topics: that jumped."""
-
-    change: int
-    after: int
-    topics: list[_Topic]
-
-    @property
-    def names(self) -> str:
-        """The topics for people: the truth's are no sensor's."""
-        told = [own.name for own in self.topics if own.kind is not TruthMessage] or [self.topics[0].name]
-        return ", ".join(dict.fromkeys(told))
-
-
 class MessageClocks:
     """Takes messages in the order of their arrival, gives them back with stamps on one clock.
 
@@ -129,12 +91,12 @@ class MessageClocks:
     def __init__(self, dropped: Counter[str] | None = None):
         """dropped: where losses are counted, a counter of its own if not given."""
         self.dropped: Counter[str] = Counter() if dropped is None else dropped
-        self._topics: dict[str, _Topic] = {}
+        self._topics: dict[str, TopicClock] = {}
         self._held: deque[_Held] = deque()
-        self._reference: _Topic | None = None
-        self._newest: _Topic | None = None  # the last good message's, not of the truth
+        self._reference: TopicClock | None = None
+        self._newest: TopicClock | None = None  # the last good message's, not of the truth
         self._out: int | None = None  # the latest stamp given back
-        self._jumps: list[_Jump] = []
+        self._jumps: list[Jump] = []
         self._apart: list[str] = []
         self._first: tuple[int, int] | None = None  # stamp given back and log time
         self._paused: tuple[int, int] | None = None  # the longest pause over a day, and what was given back before
@@ -150,7 +112,7 @@ class MessageClocks:
         """
         own = self._topics.get(topic)
         if own is None:
-            own = self._topics[topic] = _Topic(topic, type(message))
+            own = self._topics[topic] = TopicClock(topic, type(message))
         stamp = message.stamp
         if log_time is None and not -_ABSURD < stamp < _ABSURD:
             self._drop(own)
@@ -178,41 +140,11 @@ class MessageClocks:
     def warnings(self) -> list[str]:
         """What was wrong with clocks so far, one line each."""
         told = list(self._apart)
-        for jump in self._jumps[:_MOST_TOLD]:
-            way = "back" if jump.change > 0 else "forward"
-            told.append(
-                f"stamps of {jump.names} jump {way} by {_span(jump.change)} after {jump.after / 1e9:.1f} s: "
-                "a clock was set, or a recording played again; the run goes on without the jump (synchronise the "
-                "clock before recording)"
-            )
         if self._paused is not None and self._first is not None:
-            told.append(
-                f"nothing was recorded for {_span(self._paused[0])} after "
-                f"{(self._paused[1] - self._first[0]) / 1e9:.1f} s: was the clock set (from 1970, by NTP)? the run goes on"
-            )
-        if len(self._jumps) > _MOST_TOLD:
-            told.append(f"clocks jump {len(self._jumps) - _MOST_TOLD} more times")
-        for own in self._topics.values():
-            if own.kind is TruthMessage:
-                continue
-            if own.bare and own.known:
-                told.append(
-                    f"{own.bare} of {own.good + own.bare + own.bad} messages of {own.name} have no stamp, or one "
-                    "again and again: their log time is taken; does its driver wait for a clock (use_sim_time)?"
-                )
-            if own.kind is not RangeMessage and own.twice > _MANY * own.good:
-                told.append(
-                    f"{own.twice} of {own.good} messages of {own.name} have the stamp of the one before and are left "
-                    "out: were two recordings of the same merged, or are the stamps whole seconds?"
-                )
-            if own.bad > _MANY * (own.good + own.bad):
-                told.append(
-                    f"{own.bad} of {own.good + own.bad} messages of {own.name} are dropped: their stamps do not go "
-                    "with those around them; do two senders on different clocks share the topic?"
-                )
-        return told
+            told.append(told_pause(self._paused[0], self._paused[1] - self._first[0]))
+        return [*told, *told_jumps(self._jumps), *(line for own in self._topics.values() for line in own.warnings())]
 
-    def _good(self, own: _Topic, message: Message, stamp: int, log: int | None) -> Message:
+    def _good(self, own: TopicClock, message: Message, stamp: int, log: int | None) -> Message:
         """A message with its stamp on the common clock; its topic goes on from it."""
         out = stamp + own.shift
         if log is not None:
@@ -235,7 +167,7 @@ class MessageClocks:
                 self._first = out, log or 0
         return replace(message, stamp=out) if own.shift else message
 
-    def _drop(self, own: _Topic) -> None:
+    def _drop(self, own: TopicClock) -> None:
         own.bad += 1
         self.dropped[f"{_WORDS.get(own.kind, 'ground truth')}: stamp apart from its neighbours'"] += 1
 
@@ -275,7 +207,7 @@ class MessageClocks:
             self._reference = first.own
         return over
 
-    def _begin(self, own: _Topic, *, alone: bool) -> bool:
+    def _begin(self, own: TopicClock, *, alone: bool) -> bool:
         """Makes a topic's clock that of all if enough of its messages agree with each other; alone: one will do."""
         stamped = [h for h in self._held if h.own is own and not h.bare]
         for held in stamped:
@@ -360,17 +292,17 @@ class MessageClocks:
         own, before = held.own, held.own.shift
         if not own.known and held.log is not None:
             own.shift = self._common() - median_low([h.off for h in agree])
-            self._tell_apart(own)
+            self._apart += told_apart(own, self._reference)
         elif not own.known:
             own.shift = (self._out or 0) - held.stamp
-            self._tell_apart(own)
+            self._apart += told_apart(own, self._reference)
         else:
             own.shift = self._goes_on(own, agree)
         if own.known and own.shift != before:
             after = (self._out or 0) - (self._first or (0, 0))[0]
-            self._jumps.append(_Jump(own.shift - before, after, [own]))
+            self._jumps.append(Jump(own.shift - before, after, [own]))
 
-    def _goes_on(self, own: _Topic, agree: list[_Held]) -> int:
+    def _goes_on(self, own: TopicClock, agree: list[_Held]) -> int:
         """What a topic whose clock was set is moved by: the log tells how much time has passed. Where it does not, a
         step ahead is a pause, and stamps that went back go on after the last one."""
         held, after = agree[:2]
@@ -380,27 +312,9 @@ class MessageClocks:
             return own.shift
         return (self._out or 0) + max(after.stamp - held.stamp, 1) - held.stamp
 
-    def _log_tells(self, own: _Topic) -> bool:
+    def _log_tells(self, own: TopicClock) -> bool:
         """Whether time has passed in the log as in the stamps."""
         if self._first is None:
             return False
         passed, logged = own.stamp + own.shift - self._first[0], own.log - self._first[1]
         return abs(passed - logged) <= _DRIFT * max(passed, logged) + _SAME
-
-    def _tell_apart(self, own: _Topic) -> None:
-        if own.kind is TruthMessage or self._reference is None:
-            return
-        way = "behind" if own.shift > 0 else "ahead of"
-        self._apart.append(
-            f"stamps of {own.name} are {_span(own.shift)} {way} those of {self._reference.name}: another clock; they "
-            "are put on that one by their log times (synchronise both clocks before recording)"
-        )
-
-
-def _span(ns: int) -> str:
-    """A time in the unit that fits."""
-    seconds = abs(ns) / 1e9
-    for unit, size in (("years", 31_557_600.0), ("days", 86_400.0), ("h", 3600.0)):
-        if seconds >= 2 * size or (unit == "h" and seconds >= size):
-            return f"{seconds / size:.1f} {unit}"
-    return f"{seconds:.2f} s"
