@@ -9,12 +9,14 @@ import numpy as np
 
 from uwbslam_jax.backend.final_solution import Hindsight, Question, look_back
 from uwbslam_jax.backend.graph import Graph
+from uwbslam_jax.backend.range_latency import Latency, find_latency, retimed
 from uwbslam_jax.backend.range_means import Node
-from uwbslam_jax.backend.revision import Reviser, Revision, is_news, take_over
+from uwbslam_jax.backend.revision import UNSOLVED, Reviser, Revision, is_news, take_over
 from uwbslam_jax.backend.smoothing import Solution
 from uwbslam_jax.estimator import Changes, Estimate, HostView, Moved, SlotEvent, state_vector
 from uwbslam_jax.mapping import Tiles, redraw
 from uwbslam_jax.measurements import StampedFrame
+from uwbslam_jax.numerics import DECIDED
 from uwbslam_jax.result import EventKind
 from uwbslam_jax.settings import HostParams, Params, Settings, make_host_params, make_params
 
@@ -45,13 +47,16 @@ class BackEnd:
 
     Attributes:
       graph: what the run is solved from. taken_over: how often the state was corrected.
-      hindsight: the solution once the run is over, else None.
+      hindsight: the solution once the run is over, else None. failure: why there is none though there should be.
+      latency: of the ranges' stamps, where it was found to matter; the solution takes it into account.
     """
 
     def __init__(self, settings: Settings):
         self._settings = settings
         self.graph = Graph()
         self.hindsight: Hindsight | None = None
+        self.failure = ""
+        self.latency: Latency | None = None
         self.taken_over = 0
         self.enabled = settings.filter.preset == "robust" and not settings.filter.lidar_only
         self._reviser = Reviser()
@@ -147,10 +152,23 @@ class BackEnd:
     def finish(self, view: HostView, stamps: np.ndarray, poses: np.ndarray, sight: np.ndarray) -> Changes:
         """The run solved for the last time. stamps, poses, sight: of every frame, see look_back."""
         self._reviser.close()
+        try:
+            return self._solve_last(view, stamps, poses, sight)
+        except UNSOLVED as error:  # what was published along the way is worth keeping
+            self.hindsight, self.failure = None, " ".join(str(error).split())
+            return Changes()
+
+    def _solve_last(self, view: HostView, stamps: np.ndarray, poses: np.ndarray, sight: np.ndarray) -> Changes:
         question = self._question(view)
         self.hindsight = None if question is None else look_back(question, stamps, poses, sight)
-        if self.hindsight is None:
+        if self.hindsight is None or question is None:
             return Changes()
+        late = find_latency(self.hindsight, self.graph, stamps, question.host)
+        if late is not None and late.notable:
+            on_time = retimed(self.graph, self.hindsight, stamps, question.host, late.late)
+            again = look_back(question._replace(graph=on_time), stamps, poses, sight)
+            if again is not None and again.solution.cost < self.hindsight.solution.cost - DECIDED:
+                self.hindsight, self.latency = again, late
         solution = self.hindsight.solution
         bias, _ = self._biases(view, solution)
         params = self._params(view, bias)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -41,6 +42,8 @@ _ODOMETRY_EVERY_S = 0.08
 """Frames made by the odometry are at least so far apart."""
 _ODOMETRY_LAGS_S = 15.0
 """Ranges wait this long for odometry that has come before."""
+_LONGEST_S = 3600.0
+"""No time between two frames is taken for longer: a clock that was set by years does not make beacons wander."""
 _ODOMETRY_HOLD_S = 0.3
 """The last odometry is extrapolated at most this far."""
 
@@ -61,6 +64,7 @@ class FrameAssembler:
         self.warnings: list[str] = []
         self.odometry_used = False
         self._settings = settings
+        self._latency = round(settings.uwb.latency * 1e9)
         self._max_ranges = max_ranges
         self._ranges: list[RangeMessage] = []
         self._newest_range: dict[tuple[int, int], int] = {}
@@ -115,6 +119,8 @@ class FrameAssembler:
         if not (np.isfinite(message.range) and 0.0 < message.range <= self._settings.uwb.max_range):
             self.dropped["range: not finite, not positive or too long"] += 1
             return []
+        if self._latency:
+            message = replace(message, stamp=message.stamp - self._latency)
         if message.source == message.target:
             self.dropped["range: a node to itself"] += 1
             return []
@@ -122,7 +128,7 @@ class FrameAssembler:
         if message.stamp <= self._newest_range.get(pair, -1):
             self.dropped["range: stamp not after the pair's one before"] += 1
             return []
-        if self._last is not None and message.stamp <= self._last - int(0.5e9):
+        if self._last is not None and message.stamp <= self._last - int(0.5e9) - self._latency:
             self.dropped["range: arrived too late"] += 1
             return []
         if self._slot(message.source) is None or self._slot(message.target) is None:
@@ -197,7 +203,7 @@ class FrameAssembler:
         return min(max(_BLIND_SCANS * float(np.median(self._intervals)) / 1e9, _BLIND_S), _SCANLESS_S)
 
     def _close(self, stamp: int, ranges: list[RangeMessage], scan: ScanMessage | None) -> StampedFrame:
-        dt = 0.0 if self._last is None else (stamp - self._last) / 1e9
+        dt = 0.0 if self._last is None else min((stamp - self._last) / 1e9, _LONGEST_S)
         odometry = self._increment(stamp)
         if len(ranges) > self._max_ranges:
             self.dropped["range: more than one frame holds"] += len(ranges) - self._max_ranges
