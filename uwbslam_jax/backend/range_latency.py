@@ -65,7 +65,7 @@ def find_latency(hindsight: Hindsight, graph: Graph, stamps: np.ndarray, host: H
     means, to = means[to >= 0], to[to >= 0]
     if len(means) < _FEWEST:
         return None
-    way, time = _Way(hindsight, stamps, host), _times(graph, means, int(stamps[0]))
+    way, time = _Way(hindsight, stamps, host), (means["stamp"] - float(stamps[0])) / 1e9
     slot, sigma = means["slot"], np.maximum(means["sigma"].astype(float), 1e-3)
     bias = np.array([solution.bias.get(k, 0.0) for k in slot.tolist()]) + solution.bias.get(0, 0.0)
     distance = host.slant(means["distance"].astype(float), 0, slot) - bias
@@ -105,7 +105,7 @@ def retimed(graph: Graph, hindsight: Hindsight, stamps: np.ndarray, host: HostPa
     graph = graph.copy()
     keys, broken, poses = graph.stamps(), graph.keyframes["broken"], hindsight.solution.poses
     means, start = graph.ranges.means.values, int(stamps[0])
-    time = _times(graph, means, start) - late
+    time = (means["stamp"] - float(start)) / 1e9 - late
     place, key_time = _Way(hindsight, stamps, host)(time), (keys - start) / 1e9
     at = np.clip(np.searchsorted(key_time, time, side="right") - 1, 0, len(keys) - 2)
     means["share"] = np.clip((time - key_time[at]) / np.maximum(key_time[at + 1] - key_time[at], 1e-6), 0.0, 1.0)
@@ -114,9 +114,3 @@ def retimed(graph: Graph, hindsight: Hindsight, stamps: np.ndarray, host: HostPa
         means[name] = turned(-wrapped(poses[k, 2]), place - poses[k, :2])
     graph.ranges.means.keep(~broken[at + 1])
     return graph
-
-
-def _times(graph: Graph, means: np.ndarray, start: int) -> np.ndarray:
-    """(n,) when ranges were stamped, in the mean [s since the start, ns]."""
-    key_time, at = (graph.stamps() - start) / 1e9, means["at"]
-    return key_time[at] + means["share"] * (key_time[at + 1] - key_time[at])

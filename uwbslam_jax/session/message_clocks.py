@@ -40,6 +40,8 @@ _SLOW = 6
 _DRIFT = 0.1
 """A log whose time passes otherwise than the stamps by more than this share tells no pauses [1]: it was written later,
 or the recording played at another speed."""
+_BEGIN = 64
+"""Where some of a topic's first so many stamps come again, a recording is played in a loop [messages]."""
 _RECENT = 8
 """So many jumps of other topics may be this one's too [jumps]."""
 _WORDS: dict[type, str] = {ScanMessage: "scan", RangeMessage: "range", OdometryMessage: "odometry"}
@@ -154,10 +156,12 @@ class MessageClocks:
             else:
                 own.usual = off
             own.log = log
-        own.twice += own.known and stamp == own.stamp
+        own.twice += own.known and log is not None and stamp == own.stamp
         own.stamp, own.known = stamp, True
         own.good += 1
-        if own.kind is not TruthMessage or self._newest is None:
+        if own.good <= _BEGIN:
+            own.begin.add(stamp)
+        if own.kind is not TruthMessage or own is self._reference:
             self._newest = own
             if self._out is None or out > self._out:
                 if self._out is not None and out - self._out > max(_DAY, (self._paused or (0, 0))[0]):
@@ -167,9 +171,11 @@ class MessageClocks:
                 self._first = out, log or 0
         return replace(message, stamp=out) if own.shift else message
 
-    def _drop(self, own: TopicClock) -> None:
-        own.bad += 1
-        self.dropped[f"{_WORDS.get(own.kind, 'ground truth')}: stamp apart from its neighbours'"] += 1
+    def _drop(self, own: TopicClock, *, again: bool = False) -> None:
+        own.again += again
+        own.bad += not again
+        why = "recorded before, in a loop" if again else "stamp apart from its neighbours'"
+        self.dropped[f"{_WORDS.get(own.kind, 'ground truth')}: {why}"] += 1
 
     def _settled(self, *, ended: bool) -> Iterator[Message]:
         """What need not wait any longer."""
@@ -177,6 +183,10 @@ class MessageClocks:
             if self._reference is None and not self._refer(ended=ended):
                 return
             held = self._held[0]
+            if 0 < held.stamp <= held.own.until:
+                self._held.popleft()
+                self._drop(held.own, again=True)
+                continue
             if held.bare:
                 self._held.popleft()
                 yield self._bare(held)
@@ -188,7 +198,7 @@ class MessageClocks:
             if verdict:
                 yield self._good(held.own, held.message, held.stamp, held.log)
             else:
-                self._drop(held.own)
+                self._drop(held.own, again=0 < held.stamp <= held.own.until)
 
     def _refer(self, *, ended: bool) -> bool:
         """Whether it is known on whose clock all is put: the scans', or that of the best there is once these had time
@@ -275,6 +285,9 @@ class MessageClocks:
         if any(self._fits(h) or (not own.known and self._on_common(h)) for h in later):
             return False
         agree = [h for h in later if held.near(h)]
+        if len(agree) >= _AGREE and len(own.begin & {h.stamp for h in [held, *agree]}) >= _AGREE:
+            own.until = own.stamp
+            return False
         if len(agree) >= _AGREE:
             self._set([held, *agree[:_AGREE]])
             return True

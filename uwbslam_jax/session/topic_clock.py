@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from uwbslam_jax.measurements import RangeMessage, TruthMessage
 
@@ -16,7 +16,8 @@ _MOST_TOLD = 3
 class TopicClock:
     """One topic so far. stamp, log: of its last good message [ns]. shift: what its stamps are moved by. last, usual: of
     moved stamp less log time [ns]. known: whether one was good. good, bad, bare, twice: messages, those dropped, those
-    without a stamp, those with the stamp of the one before."""
+    without a stamp, those with the stamp of the one before. begin: its first stamps. until: those up to it come
+    again; again: so many messages do."""
 
     name: str
     kind: type
@@ -30,12 +31,20 @@ class TopicClock:
     bad: int = 0
     bare: int = 0
     twice: int = 0
+    begin: set[int] = field(default_factory=set)
+    until: int = 0
+    again: int = 0
 
     def warnings(self) -> list[str]:
         """What is wrong with its stamps, one line each; nothing of a truth."""
         if self.kind is TruthMessage:
             return []
         told, heard = [], self.good + self.bare + self.bad
+        if self.again:
+            told.append(
+                f"{self.again} messages of {self.name} come again, stamp for stamp: a recording played in a loop (ros2 "
+                "bag play --loop); the repetition is left out"
+            )
         if self.bare and self.known:
             told.append(
                 f"{self.bare} of {heard} messages of {self.name} have no stamp, or one again and again: their log time "
