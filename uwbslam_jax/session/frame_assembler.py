@@ -64,6 +64,7 @@ class FrameAssembler:
         self.warnings: list[str] = []
         self.odometry_used = False
         self._settings = settings
+        self._max_range = settings.uwb.max_range
         self._latency = round(settings.uwb.latency * 1e9)
         self._max_ranges = max_ranges
         self._ranges: list[RangeMessage] = []
@@ -116,7 +117,7 @@ class FrameAssembler:
         return [*waiting, self._close(scan.stamp, ready, scan)]
 
     def _add_range(self, message: RangeMessage) -> list[StampedFrame]:
-        if not (np.isfinite(message.range) and 0.0 < message.range <= self._settings.uwb.max_range):
+        if not 0.0 < message.range <= self._max_range:
             self.dropped["range: not finite, not positive or too long"] += 1
             return []
         if self._latency:
@@ -124,14 +125,15 @@ class FrameAssembler:
         if message.source == message.target:
             self.dropped["range: a node to itself"] += 1
             return []
-        pair = (min(message.source, message.target), max(message.source, message.target))
+        a, b = message.source, message.target
+        pair = (a, b) if a < b else (b, a)
         if message.stamp <= self._newest_range.get(pair, -1):
             self.dropped["range: stamp not after the pair's one before"] += 1
             return []
         if self._last is not None and message.stamp <= self._last - int(0.5e9) - self._latency:
             self.dropped["range: arrived too late"] += 1
             return []
-        if self._slot(message.source) is None or self._slot(message.target) is None:
+        if (a not in self.slots and self._slot(a) is None) or (b not in self.slots and self._slot(b) is None):
             self.dropped["range: more beacons than max_beacons"] += 1
             return []
         self._newest_range[pair] = message.stamp

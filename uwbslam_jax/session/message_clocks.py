@@ -35,8 +35,8 @@ _WAIT, _WAIT_MESSAGES = 2_000_000_000, 4096
 """What is in doubt waits for so long by the log, and behind so many messages, at most [ns, messages]."""
 _START = 1_000_000_000
 """So long at most scans are waited for, on whose clock all is put [ns]."""
-_SLOW = 6
-"""The usual difference to the log time follows the last 2 ** 6 = 64 messages or so [bits]."""
+_SELDOM = 15
+"""Of 16 messages in no doubt one tells the usual difference to the log time anew [bits of the count]."""
 _DRIFT = 0.1
 """A log whose time passes otherwise than the stamps by more than this share tells no pauses [1]: it was written later,
 or the recording played at another speed."""
@@ -97,7 +97,7 @@ class MessageClocks:
         self._held: deque[_Held] = deque()
         self._reference: TopicClock | None = None
         self._newest: TopicClock | None = None  # the last good message's, not of the truth
-        self._out: int | None = None  # the latest stamp given back
+        self._out = 0  # the latest stamp given back
         self._jumps: list[Jump] = []
         self._apart: list[str] = []
         self._first: tuple[int, int] | None = None  # stamp given back and log time
@@ -116,16 +116,27 @@ class MessageClocks:
         if own is None:
             own = self._topics[topic] = TopicClock(topic, type(message))
         stamp = message.stamp
-        if log_time is None and not -_ABSURD < stamp < _ABSURD:
-            self._drop(own)
-            return []
         if log_time is not None:
             if log_time < self._raw_log - _LOG_BACK:
                 self._leap += self._raw_log - log_time
             self._raw_log = log_time
             log_time += self._leap
-        if own.known and not self._held and 0 < stamp - own.stamp <= _NEAR:
-            return [self._good(own, message, stamp, log_time)]
+        elif not -_ABSURD < stamp < _ABSURD:
+            self._drop(own)
+            return []
+        # nearly all messages: what `_good` does, as far as it is to be done here
+        if 0 < stamp - own.stamp <= _NEAR and own.good >= _BEGIN and not self._held:
+            own.stamp = stamp
+            own.good += 1
+            if log_time is not None:
+                own.log = log_time
+                if not own.good & _SELDOM:
+                    own.follow(_NEAR)
+            if own.kind is not TruthMessage:
+                self._newest = own
+                if stamp + own.shift > self._out:
+                    self._out = stamp + own.shift
+            return [replace(message, stamp=stamp + own.shift) if own.shift else message]
         self._held.append(_Held(message, stamp, log_time, own))
         return list(self._settled(ended=False))
 
@@ -149,26 +160,22 @@ class MessageClocks:
     def _good(self, own: TopicClock, message: Message, stamp: int, log: int | None) -> Message:
         """A message with its stamp on the common clock; its topic goes on from it."""
         out = stamp + own.shift
-        if log is not None:
-            own.last = off = out - log
-            if own.known:
-                own.usual += min(max(off - own.usual, -_NEAR), _NEAR) >> _SLOW
-            else:
-                own.usual = off
-            own.log = log
         own.twice += own.known and log is not None and stamp == own.stamp
-        own.stamp, own.known = stamp, True
+        own.stamp = stamp
+        if log is not None:
+            own.log = log
+            own.usual = own.usual if own.known else own.last
+        own.known = True
         own.good += 1
         if own.good <= _BEGIN:
             own.begin.add(stamp)
         if own.kind is not TruthMessage or own is self._reference:
             self._newest = own
-            if self._out is None or out > self._out:
-                if self._out is not None and out - self._out > max(_DAY, (self._paused or (0, 0))[0]):
-                    self._paused = out - self._out, self._out
-                self._out = out
             if self._first is None:
-                self._first = out, log or 0
+                self._first, self._out = (out, log or 0), out
+            if out - self._out > max(_DAY, (self._paused or (0, 0))[0]):
+                self._paused = out - self._out, self._out
+            self._out = max(out, self._out)
         return replace(message, stamp=out) if own.shift else message
 
     def _drop(self, own: TopicClock, *, again: bool = False) -> None:
@@ -224,14 +231,14 @@ class MessageClocks:
             agree = [h for h in stamped if held.near(h)]
             if len(agree) > _AGREE or (alone and len(agree) == len(stamped)):
                 self._reference = own
-                own.last = own.usual = median_low([h.off for h in agree])
+                own.usual = median_low([h.off for h in agree])
                 return True
         return False
 
     def _common(self) -> int:
         """Usual difference of stamps and log time now [ns]."""
         own = self._newest or self._reference
-        return 0 if own is None else own.last
+        return 0 if own is None else own.last if own.known else own.usual
 
     def _bare(self, held: _Held) -> Message:
         """A message without a stamp: at its log time, on the clock of the others."""
@@ -246,7 +253,7 @@ class MessageClocks:
         """Whether a message goes on from those before."""
         own = held.own
         if not own.known:
-            return held.log is None and (self._out is None or abs(held.stamp - self._out) <= _HOUR)
+            return held.log is None and (self._first is None or abs(held.stamp - self._out) <= _HOUR)
         step = held.stamp - own.stamp
         if held.log is None:
             return -_NEAR <= step <= _HOUR
@@ -257,7 +264,7 @@ class MessageClocks:
         """Whether a message fits once it is moved as others were: the clock of several topics was set."""
         own = held.own
         if held.log is None:
-            goal = None if self._out is None else self._out - held.stamp
+            goal = None if self._first is None else self._out - held.stamp
             near = _HOUR if not own.known else _SAME
         else:
             goal, near = (own.last if own.known else self._common()) - held.off, _NEAR if own.known else _SAME
@@ -307,12 +314,12 @@ class MessageClocks:
             own.shift = self._common() - median_low([h.off for h in agree])
             self._apart += told_apart(own, self._reference)
         elif not own.known:
-            own.shift = (self._out or 0) - held.stamp
+            own.shift = self._out - held.stamp
             self._apart += told_apart(own, self._reference)
         else:
             own.shift = self._goes_on(own, agree)
         if own.known and own.shift != before:
-            after = (self._out or 0) - (self._first or (0, 0))[0]
+            after = self._out - (self._first or (0, 0))[0]
             self._jumps.append(Jump(own.shift - before, after, [own]))
 
     def _goes_on(self, own: TopicClock, agree: list[_Held]) -> int:
@@ -323,7 +330,7 @@ class MessageClocks:
             return own.usual - median_low([h.off for h in agree])
         if held.stamp > own.stamp:
             return own.shift
-        return (self._out or 0) + max(after.stamp - held.stamp, 1) - held.stamp
+        return self._out + max(after.stamp - held.stamp, 1) - held.stamp
 
     def _log_tells(self, own: TopicClock) -> bool:
         """Whether time has passed in the log as in the stamps."""

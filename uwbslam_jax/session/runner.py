@@ -75,6 +75,8 @@ class Runner:
         Those of a recording or a device are on one clock already; of others only the stamps tell, see MessageClocks.
         """
         timed = self._clocks.take(message, None, type(message).__name__)
+        if len(timed) == 1:
+            return self._add(timed[0])
         return list(itertools.chain.from_iterable(map(self._add, timed)))
 
     def _add(self, message: Message) -> list[Update]:

@@ -14,17 +14,20 @@ _MOST_TOLD = 3
 
 @dataclass(slots=True)
 class TopicClock:
-    """One topic so far. stamp, log: of its last good message [ns]. shift: what its stamps are moved by. last, usual: of
-    moved stamp less log time [ns]. known: whether one was good. good, bad, bare, twice: messages, those dropped, those
-    without a stamp, those with the stamp of the one before. begin: its first stamps. until: those up to it come
-    again; again: so many messages do."""
+    """One topic so far.
+
+    Attributes:
+      stamp, log: of its last good message [ns]. shift: what its stamps are moved by [ns].
+      usual: difference of moved stamps to the log time [ns]. known: whether a message was good.
+      good, bad, bare, twice: messages, those dropped, those without a stamp, those with the stamp of the one before.
+      begin: its first stamps. until: those up to it come again; again: so many messages do.
+    """
 
     name: str
     kind: type
     stamp: int = 0
     log: int = 0
     shift: int = 0
-    last: int = 0
     usual: int = 0
     known: bool = False
     good: int = 0
@@ -34,6 +37,16 @@ class TopicClock:
     begin: set[int] = field(default_factory=set)
     until: int = 0
     again: int = 0
+
+    @property
+    def last(self) -> int:
+        """Difference of the last good message's moved stamp to its log time [ns]."""
+        return self.stamp + self.shift - self.log
+
+    def follow(self, most: int) -> None:
+        """Takes the last good message in, which may be off by this much [ns]: the usual difference is that of some 64
+        messages."""
+        self.usual += min(max(self.last - self.usual, -most), most) >> 2
 
     def warnings(self) -> list[str]:
         """What is wrong with its stamps, one line each; nothing of a truth."""
