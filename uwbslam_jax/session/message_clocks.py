@@ -40,7 +40,7 @@ _SELDOM = 15
 _DRIFT = 0.1
 """A log whose time passes otherwise than the stamps by more than this share tells no pauses [1]: it was written later,
 or the recording played at another speed."""
-_BEGIN = 64
+_BEGIN = 16
 """Where some of a topic's first so many stamps come again, a recording is played in a loop [messages]."""
 _RECENT = 8
 """So many jumps of other topics may be this one's too [jumps]."""
