@@ -26,8 +26,8 @@ _DAY, _HOUR = 86_400_000_000_000, 3_600_000_000_000
 """A pause of more than a day is worth a word; without log times, one of up to an hour is in no doubt [ns]."""
 _LOG_BACK = 1_000_000_000
 """Log times that go back by more tell that the recorder's clock was set back [ns]; writers' queues mix up less."""
-_ABSURD = 1 << 62
-"""Stamps from here on are nobody's [ns]: the year 2116; 64 bits end soon after."""
+_ABSURD = (1 << 31) * 1_000_000_000
+"""Stamps from here on are nobody's [ns]: the year 2038, where the seconds of ROS end."""
 _AGREE, _MOST_DOUBTED = 2, 5
 """So many later messages of a topic that agree with one tell that its clock was set; after so many that agree with
 nothing it is dropped [messages]."""
