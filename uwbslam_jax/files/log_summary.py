@@ -72,8 +72,9 @@ class LogSummary:
         lines = [f"{self.name}: {self.duration:.1f} s"]
         rows = [("topic", "role", "messages", "rate [Hz]", "largest gap [s]", "stamp - log [s]", "type")]
         for topic in self.topics:
-            times = ["-" if math.isnan(v) else f"{v:.2f}" for v in (topic.rate, topic.largest_gap, topic.offset)]
-            rows.append((topic.name, topic.role or "-", str(topic.count), *times, topic.schema))
+            times = topic.rate, topic.largest_gap, topic.offset
+            rate, gap, offset = ("-" if math.isnan(v) else f"{v:.2f}" for v in times)
+            rows.append((topic.name, topic.role or "-", str(topic.count), rate, gap, offset, topic.schema))
         widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
         for row in rows:
             cells = [
