@@ -56,7 +56,7 @@ def make(truth: np.ndarray, seed: int = 0, bias=None, sight: np.ndarray | None =
                 antenna = pose[:2] + turned(pose[2], ANTENNA)
                 ends = [turned(-p[2], antenna - p[:2]) for p in truth[[at, at + 1]]]
                 d = np.linalg.norm(antenna - spot) + bias[0] + bias[slot] + rng.normal(0, 0.05)
-                graph.ranges.means.append((at, slot, 0, share, *ends, d, 0.05, False))
+                graph.ranges.means.append((at, slot, 0, share, *ends, d, 0.05, False, 0.0))
     for i in BEACONS:
         for j in BEACONS:
             if i < j:

@@ -39,6 +39,12 @@ class Reason(str):
 
 _CLOCK = "a clock was set back, a recording is looped, or stamps are of another clock; uwbslam inspect shows them"
 """Advice for a stamp that goes back [text]."""
+_APART, _AGAIN = "stamp apart from its neighbours'", "recorded before, in a loop"
+"""Words for what a clock tells of a message, whatever the sensor [text]."""
+_ONE_STAMP = "a driver that stamps some messages wrongly"
+"""Advice for single stamps [text]."""
+_LOOP = "a recording that was played in a loop while it was recorded: its first pass is used"
+"""Advice for what comes again [text]."""
 _BYTES = "bytes are damaged or do not fit the type that the recording gives; uwbslam inspect lists the types"
 """Advice for a message that does not decode [text]."""
 _LINE = "a loose or long cable, another baud, or a second program at the port"
@@ -48,6 +54,8 @@ _LINE = "a loose or long cable, another baud, or a second program at the port"
 class ScanLost:
     """Of scans."""
 
+    APART = Reason(Sensor.SCAN, _APART, _ONE_STAMP)
+    AGAIN = Reason(Sensor.SCAN, _AGAIN, _LOOP)
     STAMP = Reason(Sensor.SCAN, "stamp not after the one before", _CLOCK)
     NO_BEARINGS = Reason(Sensor.SCAN, "no beams or no bearings", "the LiDAR's driver leaves its fields empty")
     NO_BEAMS = Reason(Sensor.SCAN, "no beams", "the LiDAR measures nothing, or its driver leaves the readings out")
@@ -69,6 +77,8 @@ class ScanLost:
 class RangeLost:
     """Of ranges."""
 
+    APART = Reason(Sensor.RANGE, _APART, _ONE_STAMP)
+    AGAIN = Reason(Sensor.RANGE, _AGAIN, _LOOP)
     IMPOSSIBLE = Reason(Sensor.RANGE, "not finite, not positive or too long", "another unit, or --uwb.max-range")
     NOT_POSITIVE = Reason(Sensor.RANGE, "not finite or not positive", "the radio reports failed exchanges as ranges")
     SELF = Reason(Sensor.RANGE, "a node to itself", "two radios have one id")
@@ -96,6 +106,8 @@ class RangeLost:
 class OdometryLost:
     """Of odometry."""
 
+    APART = Reason(Sensor.ODOMETRY, _APART, _ONE_STAMP)
+    AGAIN = Reason(Sensor.ODOMETRY, _AGAIN, _LOOP)
     NOT_FINITE = Reason(Sensor.ODOMETRY, "not finite", "the wheels' node reports no pose")
     NO_ROTATION = Reason(
         Sensor.ODOMETRY, "orientation is no rotation", "the wheels' node leaves the quaternion at zero; mend it there"

@@ -176,6 +176,8 @@ class UwbSettings:
     """Slots for beacons to begin with; where more are heard, room is made in the run, which compiles anew."""
     max_range: float = 200.0
     """Longer ranges are dropped and counted [m]."""
+    latency: float = 0.0
+    """How long after an exchange its stamp is taken [s], by a slow serial line, say: it is subtracted."""
     height: dict[str, float] = field(default_factory=dict)
     """Height of a node's antenna above the floor by id [m]; where not given, that of the robot's antenna."""
     bias: dict[str, float] = field(default_factory=dict)

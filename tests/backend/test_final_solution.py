@@ -9,12 +9,15 @@ import pytest
 import small_room as room
 from room_drive import BEACONS, SETTINGS, Drive, assert_same_bits, pose_at
 
+from uwbslam_jax.backend import final_solution
 from uwbslam_jax.backend.final_solution import Question, _track
 from uwbslam_jax.backend.graph import KEYFRAME, Graph
 from uwbslam_jax.backend.revision import Reviser
 from uwbslam_jax.evaluation import rigid_fit
+from uwbslam_jax.numerics import SingularError
 from uwbslam_jax.numerics.se2_host import wrapped
 from uwbslam_jax.result import EventKind
+from uwbslam_jax.session.result_builder import Facts, to_result
 from uwbslam_jax.session.session import CONTROL_EVERY, Session
 from uwbslam_jax.settings import FilterSettings, UwbSettings
 
@@ -25,7 +28,7 @@ LOOKS = 50
 """Two and a half rounds of the room."""
 
 
-def driven(settings=SETTINGS, bias=None, online: bool = False) -> tuple[Session, np.ndarray]:
+def driven(settings=SETTINGS, bias=None, online: bool = False, late: float = 0.0) -> tuple[Session, np.ndarray]:
     """A finished run, and where the robot truly was at each frame (T, 3)."""
     run = Session(settings)
     drive = Drive(run)
@@ -33,6 +36,7 @@ def driven(settings=SETTINGS, bias=None, online: bool = False) -> tuple[Session,
     frames = drive.frames(LOOKS * CONTROL_EVERY, NODES)
     for frame in frames:
         r = frame.frame.ranges
+        r.age[r.valid] += np.float32(late)
         for node, by in (bias or {}).items():
             r.range[(r.i == frame.slots[node]) | (r.j == frame.slots[node])] += np.float32(by)
     for k in range(LOOKS):
@@ -182,3 +186,33 @@ def test_a_revision_may_take_the_longer_the_longer_the_run_is(finished, keyframe
         looks += 1
     reviser.close()
     assert looks < 10 + keyframes
+
+
+@pytest.mark.slow
+def test_ranges_that_are_stamped_late_are_found_and_taken_at_their_time() -> None:
+    run, truth = driven(late=0.3)
+    found = run.back_end.latency
+    assert found is not None
+    assert abs(found.late - 0.3) < 0.1
+    assert run.hindsight is not None
+    robot, beacons = off(run, run.hindsight.track, truth)
+    assert np.sqrt(np.mean(robot**2)) < 0.03
+    assert beacons.max() < 0.15  # nearly a circle: a lap begun later looks much like beacons turned; 0.4 m if untold
+
+
+def test_ranges_that_are_on_time_are_not_late(finished) -> None:
+    assert finished[0].back_end.latency is None
+
+
+@pytest.mark.slow
+def test_a_run_that_cannot_be_solved_keeps_what_was_published(monkeypatch: pytest.MonkeyPatch) -> None:
+    def singular(*_: object) -> None:
+        raise SingularError("Factor is exactly singular")
+
+    monkeypatch.setattr(final_solution, "solve", lambda *_, **__: singular())
+    run, truth = driven()
+    assert run.hindsight is None
+    found = to_result(run, Facts())
+    assert len(found.stamps) == len(truth)
+    assert len(found.beacons) == 3
+    assert [told for told in found.summary["warnings"] if "could not be solved as a whole (Factor" in told]

@@ -171,3 +171,19 @@ def test_unknowns_are_eliminated_in_an_order_that_keeps_the_factor_sparse() -> N
     lower, factor = entries(problem.rank)
     assert factor < 1.5 * lower
     assert factor < 0.2 * entries(problem.size - 1 - problem.rank)[1]
+
+
+def test_what_nothing_ties_stays_where_it_is_and_the_rest_is_solved() -> None:
+    for count in (4, 400):  # dense and sparse
+
+        def fill(x: np.ndarray, rows: sparse_least_squares.Sink, count: int = count) -> None:
+            free = np.arange(count - 1)
+            rows.add(x[free] - 1.0, [(free, np.ones(count - 1))])
+            rows.add(np.zeros(1), [(np.array([count - 1]), np.zeros(1))])
+
+        rank = np.arange(count)
+        found, cost = sparse_least_squares.minimise(fill, np.zeros(count), rank, moves=30, enough=1e-9)
+        assert np.allclose(found[:-1], 1.0)
+        assert found[-1] == 0.0
+        assert cost < 1e-9
+        assert np.isfinite(sparse_least_squares.covariance(fill, found, rank, rank)).all()

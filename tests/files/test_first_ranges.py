@@ -35,7 +35,7 @@ def drive(
     for k in range(120):
         stamp, turn = T0 + k * 100_000_000, 0.5 * max(k / 10 - rest_s, 0.0)
         if k % 10 == 0:
-            messages.append(ScanMessage(stamp, 0.0, 0.1, 0.0, 0.1, 30.0, np.ones(60, np.float32)))
+            messages.append(ScanMessage(stamp, 0.0, 0.1, 0.0, 0.1, 30.0, np.linspace(1.0, 4.0, 60, dtype=np.float32)))
         places = {robot: (3.0 + 2 * np.cos(turn), 3.0 + 2 * np.sin(turn)), **beacons}
         nodes = list(places)
         pairs = [(a, b) for i, a in enumerate(nodes) for b in nodes[i + 1 :] if all_pairs or a == robot]

@@ -302,3 +302,10 @@ def test_diagnostics_come_at_most_ten_times_a_second(tmp_path: Path) -> None:
     write_result(result, tmp_path)
     topics = [m.channel.topic for m in reader.read_ros2_messages(str(tmp_path / "result.mcap"))]
     assert topics.count("/diagnostics") == FRAMES // 4
+
+
+def test_a_clock_that_was_set_by_years_takes_no_longer(tmp_path: Path) -> None:
+    result = make_result()
+    result.stamps[:30] -= 50 * 365 * 86_400 * 1_000_000_000
+    write_result(result, tmp_path)
+    assert (tmp_path / "result.mcap").stat().st_size < 1_000_000

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -396,3 +397,17 @@ def test_every_message_is_in_a_frame_or_counted(stream, in_order):
         assert (r.j < 3).all()
         assert (r.i[r.valid] != r.j[r.valid]).all()
         assert all(np.isfinite(leaf).all() for leaf in (r.range, r.age, f.frame.odometry.increment, f.frame.dt))
+
+
+def test_no_time_between_frames_is_taken_for_years() -> None:
+    frames = list(assembler().frames([scan(0.0), scan(0.1), scan(2e9), scan(2e9 + 0.1)]))
+    assert [round(float(f.frame.dt), 3) for f in frames] == [0.0, 0.1, 3600.0, 0.1]
+
+
+def test_ranges_that_are_stamped_late_are_put_back() -> None:
+    late = dataclasses.replace(settings(), uwb=dataclasses.replace(settings().uwb, latency=0.7))
+    make = FrameAssembler(late, MAX_RANGES)
+    frames = list(make.frames([scan(0.0), ranged(0.5), scan(0.6), ranged(1.0), scan(1.1)]))
+    ages = [f.frame.ranges.age[f.frame.ranges.valid].tolist() for f in frames]
+    assert ages == [[], [pytest.approx(-0.8)], [pytest.approx(-0.8)]]
+    assert not make.dropped

@@ -9,12 +9,14 @@ import numpy as np
 
 from uwbslam_jax.backend.final_solution import Hindsight, Question, look_back
 from uwbslam_jax.backend.graph import Graph
+from uwbslam_jax.backend.range_latency import Latency, find_latency, retimed
 from uwbslam_jax.backend.range_means import Node
-from uwbslam_jax.backend.revision import Reviser, Revision, is_news, take_over
+from uwbslam_jax.backend.revision import UNSOLVED, Reviser, Revision, is_news, take_over
 from uwbslam_jax.backend.smoothing import Solution
 from uwbslam_jax.estimator import Changes, Estimate, HostView, Moved, SlotEvent, state_vector
 from uwbslam_jax.mapping import Tiles, redraw
 from uwbslam_jax.measurements import StampedFrame
+from uwbslam_jax.numerics import DECIDED
 from uwbslam_jax.result import EventKind
 from uwbslam_jax.settings import HostParams, Params, Settings, make_host_params, make_params
 
@@ -31,6 +33,8 @@ _ELSEWHERE = (
 """After these a node is not where it was. One that is only doubted may be: walls or a clock explain its ranges too."""
 
 
+_ROUNDS = 3
+"""So often at most a run is solved again with its ranges at another time [solutions]."""
 _NOTABLE_BIAS = 0.3
 """A bias larger than this share of sigma_n is reported; smaller ones only take up what little was learnt of them."""
 
@@ -45,13 +49,16 @@ class BackEnd:
 
     Attributes:
       settings: what the run goes by. graph: what it is solved from. taken_over: how often the state was corrected.
-      hindsight: the solution once the run is over, else None.
+      hindsight: the solution once the run is over, else None. failure: why there is none though there should be.
+      latency: of the ranges' stamps, where it was found to matter; the solution takes it into account.
     """
 
     def __init__(self, settings: Settings):
         self.settings = settings
         self.graph = Graph()
         self.hindsight: Hindsight | None = None
+        self.failure = ""
+        self.latency: Latency | None = None
         self.taken_over = 0
         self.enabled = settings.filter.preset == "robust" and not settings.filter.lidar_only
         self._reviser = Reviser()
@@ -147,10 +154,37 @@ class BackEnd:
     def finish(self, view: HostView, stamps: np.ndarray, poses: np.ndarray, sight: np.ndarray) -> Changes:
         """The run solved for the last time. stamps, poses, sight: of every frame, see look_back."""
         self._reviser.close()
+        try:
+            return self._solve_last(view, stamps, poses, sight)
+        except UNSOLVED as error:  # what was published along the way is worth keeping
+            self.hindsight, self.failure = None, " ".join(str(error).split())
+            return Changes()
+
+    def _on_time(
+        self, hindsight: Hindsight, question: Question, stamps: np.ndarray, frames: tuple[np.ndarray, np.ndarray]
+    ) -> Hindsight:
+        """The run solved with its ranges at the time when they were measured, where these are stamped late. frames:
+        poses and sight of every frame."""
+        late = find_latency(hindsight, self.graph, stamps, question.host)
+        for _ in range(_ROUNDS):  # the track was bent by the ranges, and tells better how late they are each time
+            if late is None or not late.notable:
+                break
+            on_time = retimed(self.graph, hindsight, stamps, question.host, late.late)
+            again = look_back(question._replace(graph=on_time), stamps, *frames)
+            if again is None or again.solution.cost > hindsight.solution.cost - (0.0 if self.latency else DECIDED):
+                break
+            hindsight, self.latency, before = again, late, late.late
+            late = find_latency(hindsight, self.graph, stamps, question.host)
+            if late is not None and abs(late.late - before) < late.sigma / 2:
+                break
+        return hindsight
+
+    def _solve_last(self, view: HostView, stamps: np.ndarray, poses: np.ndarray, sight: np.ndarray) -> Changes:
         question = self._question(view)
         self.hindsight = None if question is None else look_back(question, stamps, poses, sight)
-        if self.hindsight is None:
+        if self.hindsight is None or question is None:
             return Changes()
+        self.hindsight = self._on_time(self.hindsight, question, stamps, (poses, sight))
         solution = self.hindsight.solution
         bias, _ = self._biases(view, solution)
         params = self._params(view, bias)

@@ -37,13 +37,15 @@ MEAN = np.dtype(
         ("distance", np.float32),
         ("sigma", np.float32),
         ("loud", np.bool_),
+        ("stamp", np.float64),
     ]
 )
 """Ranges between the robot and a beacon at rest, averaged over half an interval between two keyframes.
 
 at: keyframe before. slot, place: the node. share: of the way to the next keyframe. before, after: the antenna in the
 frame of the keyframe before and of the one after [m]. distance: as measured, sigma: its standard deviation [m]. loud:
-whether the ranges scatter more than the radio does.
+whether the ranges scatter more than the radio does. stamp: of the exchanges in the mean [ns]; they may be from before
+the keyframe.
 """
 
 
@@ -142,4 +144,4 @@ def _mean(
     share = min(max((stamp - start) / span, 0.0), 1.0)
     before, after = (turned(-pose[2], np.array([x, y]) - pose[:2]) for pose in poses)
     sigma = mean_sigma(len(rows), *noise)
-    return share, before, after, distance, sigma, sigma > mean_sigma(1, noise[1], noise[1])
+    return share, before, after, distance, sigma, sigma > mean_sigma(1, noise[1], noise[1]), stamp

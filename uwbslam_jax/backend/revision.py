@@ -20,9 +20,11 @@ from uwbslam_jax.backend.graph import Graph
 from uwbslam_jax.backend.smoothing import Solution
 from uwbslam_jax.estimator import State, anchored, state_vector
 from uwbslam_jax.mapping import Grid, Tiles, draw_onto, redraw
-from uwbslam_jax.numerics import SIGMA_ENOUGH_M, between, compose, largest_sigma, wrapped
+from uwbslam_jax.numerics import SIGMA_ENOUGH_M, SingularError, between, compose, largest_sigma, wrapped
 from uwbslam_jax.settings import Config, Params
 
+UNSOLVED = (SingularError, np.linalg.LinAlgError)
+"""What a solution of the run raises where its equations have none [exceptions]: the run goes on without."""
 _LOOKS = 5
 """Looks of the host that the solution may take at least, and as many that the drawing may."""
 _KEYFRAMES_A_LOOK = 100
@@ -62,10 +64,14 @@ class _Job:
     epoch: float
 
     def solve(self) -> Solution | None:
-        """The run so far; what that took is handed back at once, and not whenever the allocator likes."""
-        solution = framed_solution(self.question)
-        process.give_back()
-        return solution
+        """The run so far solved, None where it cannot be; what that took is handed back at once, and not whenever the
+        allocator likes."""
+        try:
+            return framed_solution(self.question)
+        except UNSOLVED:
+            return None
+        finally:
+            process.give_back()
 
     def draw(self, solution: Solution) -> Revision:
         """The map, with the scans where the solution has them."""

@@ -44,7 +44,7 @@ def anchored(
     nodes = state_vector.node_count(len(mean))
     pose, error = np.array(state_vector.pose_indices(nodes)), np.array(state_vector.map_error_indices(nodes))
     velocity, beacon_velocities = np.arange(2 * nodes, 2 * nodes + 2), np.arange(2 * nodes + 2, 4 * nodes)
-    placed = np.concatenate([[2 * s, 2 * s + 1] for s in slots])
+    placed = np.array([[2 * s, 2 * s + 1] for s in slots], int).ravel()
     R = rotation_matrix(values[2] - mean[pose[2]])
     mean[velocity] = R @ mean[velocity]
     moving = np.append(velocity, 4 * nodes + 1)

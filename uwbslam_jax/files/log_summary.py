@@ -14,6 +14,7 @@ from uwbslam_jax.files.mounting import Mounting, read_mounting
 from uwbslam_jax.files.range_messages import Options, names_told
 from uwbslam_jax.files.schemas import Decoder, Role
 from uwbslam_jax.measurements import Message, RangeMessage, ScanMessage
+from uwbslam_jax.session import MessageClocks
 from uwbslam_jax.settings import UwbSettings
 
 
@@ -27,6 +28,7 @@ class TopicSummary:
       count: messages.
       rate: messages per second between its first and its last [Hz], NaN for fewer than two.
       largest_gap: longest time between two of its messages, by log time [s], NaN for fewer than two.
+      offset: usual difference of its stamps to the log times [s], NaN where it is not used or has no stamps.
     """
 
     name: str
@@ -35,6 +37,7 @@ class TopicSummary:
     count: int
     rate: float
     largest_gap: float
+    offset: float = math.nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,14 +76,15 @@ class LogSummary:
     def __str__(self) -> str:
         """Text of several lines, units in the column heads."""
         lines = [f"{self.name}: {self.duration:.1f} s"]
-        rows = [("topic", "role", "messages", "rate [Hz]", "largest gap [s]", "type")]
+        rows = [("topic", "role", "messages", "rate [Hz]", "largest gap [s]", "stamp - log [s]", "type")]
         for topic in self.topics:
-            rate, gap = ("-" if math.isnan(v) else f"{v:.2f}" for v in (topic.rate, topic.largest_gap))
-            rows.append((topic.name, topic.role or "-", str(topic.count), rate, gap, topic.schema))
+            times = topic.rate, topic.largest_gap, topic.offset
+            rate, gap, offset = ("-" if math.isnan(v) else f"{v:.2f}" for v in times)
+            rows.append((topic.name, topic.role or "-", str(topic.count), rate, gap, offset, topic.schema))
         widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
         for row in rows:
             cells = [
-                c.rjust(w) if 2 <= k <= 4 else c.ljust(w) for k, (c, w) in enumerate(zip(row, widths, strict=True))
+                c.rjust(w) if 2 <= k <= 5 else c.ljust(w) for k, (c, w) in enumerate(zip(row, widths, strict=True))
             ]
             lines.append("  " + "  ".join(cells).rstrip())
         if self.beams:
@@ -132,17 +136,20 @@ def inspect_log(
     look_ahead(recording, ranges, options, scans=bool({"scan", "odom"} & set(roles.values())))
     topic_of = {channel.id: channel.topic for channel in recording.channels.values()}
     clocks = {topic: _Clock() for topic in topic_of.values()}
-    heard = _Heard()
+    heard, on_clock = _Heard(), MessageClocks(options.dropped)
     for log_time, number, data in recording.records():
         if number not in topic_of:
             continue
         clocks[topic_of[number]].tick(log_time)
         if number in decoders:
-            heard.take(decoders[number](data, log_time))
+            for message in decoders[number](data, log_time):
+                heard.take(on_clock.take(message, log_time, topic_of[number]))
+    heard.take(on_clock.flush())
+    problems += on_clock.warnings
     return LogSummary(
         name=recording.name,
         duration=(recording.end - recording.start) * 1e-9,
-        topics=_topics(recording, clocks, roles),
+        topics=_topics(recording, clocks, roles, on_clock.offsets),
         ids=dict(sorted(heard.ids.items())),
         pairs=dict(sorted(heard.pairs.items())),
         powers=heard.powers,
@@ -190,7 +197,9 @@ class _Heard:
                 self.beams = max(self.beams, message.ranges.size)
 
 
-def _topics(recording: Bag, clocks: dict[str, _Clock], roles: dict[int, Role]) -> list[TopicSummary]:
+def _topics(
+    recording: Bag, clocks: dict[str, _Clock], roles: dict[int, Role], offsets: dict[str, float | None]
+) -> list[TopicSummary]:
     by_name = {channel.topic: channel for channel in recording.channels.values()}
     role_of = {recording.channels[number].topic: role for number, role in roles.items()}
     summaries = []
@@ -198,7 +207,9 @@ def _topics(recording: Bag, clocks: dict[str, _Clock], roles: dict[int, Role]) -
         span = (clock.last - clock.first) * 1e-9
         rate = (clock.count - 1) / span if span > 0 else math.nan
         gap = clock.gap * 1e-9 if clock.count > 1 else math.nan
-        summaries.append(TopicSummary(name, by_name[name].schema, role_of.get(name), clock.count, rate, gap))
+        offset = offsets.get(name)
+        times = rate, gap, math.nan if offset is None else offset
+        summaries.append(TopicSummary(name, by_name[name].schema, role_of.get(name), clock.count, *times))
     return summaries
 
 

@@ -12,12 +12,12 @@ import struct
 import zlib
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import lz4.frame
 import zstandard
@@ -36,6 +36,11 @@ PLAIN_BLOCK_BYTES, MAX_CHUNK_BYTES = 1 << 20, 1 << 30
 _HEADER, _MESSAGE, _CHUNK = struct.Struct("<BQ"), struct.Struct("<BQHIQQ"), struct.Struct("<QQQII")
 """Opcode, length; the same and channel, sequence, log and publish time; a chunk's first and last log time, size, crc,
 length of the compression's name [bytes] (MCAP specification, Records)."""
+
+
+_SET_BACK, _MOST_SET_BACK = 1_000_000_000, 8
+"""A channel's log times that go back by more, so many times at most, tell of a clock that was set back [ns, times]: in
+a file that is not in order they go back everywhere."""
 
 
 class _CorruptError(Exception):
@@ -76,10 +81,20 @@ class _Block(NamedTuple):
     offset: int  # where the content starts [byte]
     length: int  # of the content as stored [bytes]
     start: int  # first log time [ns]
+    end: int  # last log time [ns]
     size: int  # of the content once decompressed [bytes]
     crc: int  # of the content, 0 where not known
     compression: str
     whole: bool  # False where the file ends inside
+
+
+class _Part(NamedTuple):
+    """Messages of a block, from the first of these numbers to before the other one; start: their first log time."""
+
+    start: int
+    block: _Block
+    first: int = 0
+    end: int | None = None
 
 
 class Recording:
@@ -118,25 +133,74 @@ class Recording:
     def records(self, channels: set[int] | None = None) -> Iterator[RawMessage]:
         """Yields the messages of these channels (all by default) by log time, equal ones in file order.
 
+        Where the recorder's clock was set back, what was recorded later comes later, and log times go back there.
         Chunks whose times overlap are merged, so that memory grows with the overlap, not with the file. Sets
         `truncated` and ends where a chunk turns out corrupt.
         """
+        with self.path.open("rb") as file:
+            for parts in self._epochs:
+                if not (yield from self._in_order(file, parts, channels)):
+                    return
+
+    def _in_order(
+        self, file: BinaryIO, parts: list[_Part], channels: set[int] | None
+    ) -> Generator[RawMessage, Any, bool]:
+        """The messages of parts in the order of their starts; False where a chunk is corrupt."""
         pending: list[RawMessage] = []
         last = self.start
-        with self.path.open("rb") as file:
-            for index, block in enumerate(self._blocks):
-                try:
-                    pending += self._messages(self._content(file, block), channels)
-                except _CorruptError as error:
-                    self._break(block.record, max([last, *(m.log_time for m in pending)]), str(error))
-                    break
-                pending.sort(key=attrgetter("log_time"))
-                ahead = self._blocks[index + 1].start if index + 1 < len(self._blocks) else None
-                cut = len(pending) if ahead is None else bisect_right(pending, ahead, key=attrgetter("log_time"))
-                ready, pending = pending[:cut], pending[cut:]
-                last = ready[-1].log_time if ready else last
-                yield from ready
+        for index, part in enumerate(parts):
+            try:
+                pending += self._messages_of(file, part, channels)
+            except _CorruptError as error:
+                self._break(part.block.record, max([last, *(m.log_time for m in pending)]), str(error))
+                yield from pending
+                return False
+            pending.sort(key=attrgetter("log_time"))
+            ahead = parts[index + 1].start if index + 1 < len(parts) else None
+            cut = len(pending) if ahead is None else bisect_right(pending, ahead, key=attrgetter("log_time"))
+            ready, pending = pending[:cut], pending[cut:]
+            last = ready[-1].log_time if ready else last
+            yield from ready
         yield from pending
+        return True
+
+    def _messages_of(self, file: BinaryIO, part: _Part, channels: set[int] | None) -> list[RawMessage]:
+        content = self._content(file, part.block)
+        if part.first == 0 and part.end is None:
+            return self._messages(content, channels)
+        some = self._messages(content, None)[part.first : part.end]
+        return [message for message in some if channels is None or message.channel in channels]
+
+    def _by_clock(self, file: BinaryIO) -> list[list[_Part]]:
+        """Parts to be read one after the other, each by log time: several where the recorder's clock was set back, as
+        the log times of its channels tell; one where messages are only not in order."""
+        blocks, latest = self._blocks, 0
+        whole = [sorted((_Part(block.start, block) for block in blocks), key=attrgetter("start"))]
+        back = len(blocks) == 1  # nothing to compare with
+        for block in blocks:
+            back, latest = back or block.start < latest - _SET_BACK, max(latest, block.end)
+        if not back:
+            return whole
+        epochs: list[list[_Part]] = [[]]
+        heard: dict[int, int] = {}
+        for block in blocks:
+            try:
+                messages = self._messages(self._content(file, block), None)
+            except _CorruptError:
+                return whole
+            cuts = [0]
+            for k, (log_time, channel, _) in enumerate(messages):
+                if log_time < heard.get(channel, 0) - _SET_BACK:
+                    heard.clear()
+                    cuts.append(k)
+                heard[channel] = log_time
+            for first, end in zip(cuts, [*cuts[1:], None], strict=True):
+                epochs += [[]] if first else []
+                if some := messages[first:end]:
+                    epochs[-1].append(_Part(min(m.log_time for m in some), block, first, end))
+            if len(epochs) > _MOST_SET_BACK:
+                return whole
+        return [sorted(parts, key=attrgetter("start")) for parts in epochs] if len(epochs) > 1 else whole
 
     def _check_magic(self, file: BinaryIO) -> None:
         head = file.read(16)
@@ -180,7 +244,7 @@ class Recording:
         head = file.read(_HEADER.size + _CHUNK.size)
         if len(head) < _HEADER.size + _CHUNK.size:
             return None
-        start, _, size, crc, name_length = _CHUNK.unpack_from(head, _HEADER.size)
+        start, last, size, crc, name_length = _CHUNK.unpack_from(head, _HEADER.size)
         tail = file.read(name_length + 8) if name_length <= 64 else b""  # "zstd" or "lz4": anything long is noise
         if len(tail) < name_length + 8:
             return None
@@ -188,7 +252,7 @@ class Recording:
         offset = position + len(head) + len(tail)
         compression = tail[:name_length].decode("utf-8", "replace")
         stored = min(length, self.size - offset)
-        return _Block(position, offset, stored, start, size, crc, compression, stored == length)
+        return _Block(position, offset, stored, start, last, size, crc, compression, stored == length)
 
     def _take_stock(self, file: BinaryIO, broken_at: int | None) -> None:
         """Channels, counts and times: from the summary, or by reading through where there is none."""
@@ -212,7 +276,7 @@ class Recording:
                 self.end = max([self.end, *times])
         if broken_at is not None and self.truncated is None:
             self._break(broken_at, self.end, "")
-        self._blocks.sort(key=attrgetter("start"))
+        self._epochs = self._by_clock(file)
 
     def _content(self, file: BinaryIO, block: _Block) -> bytes:
         """The records of a block, decompressed; of a block that the file ends in, those bytes that are there."""
@@ -284,9 +348,11 @@ def _add_plain(blocks: list[_Block], position: int, length: int, log_time: int) 
         last = blocks[-1]
         joined = last.length + length
         if last.record == last.offset and last.offset + last.length == position and joined <= PLAIN_BLOCK_BYTES:
-            blocks[-1] = last._replace(length=joined, size=joined, start=min(last.start, log_time))
+            blocks[-1] = last._replace(
+                length=joined, size=joined, start=min(last.start, log_time), end=max(last.end, log_time)
+            )
             return
-    blocks.append(_Block(position, position, length, log_time, length, 0, "", True))
+    blocks.append(_Block(position, position, length, log_time, log_time, length, 0, "", True))
 
 
 class RecordWriter:

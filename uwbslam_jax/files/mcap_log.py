@@ -35,6 +35,7 @@ from uwbslam_jax.files.schemas import (
     unpacker,
 )
 from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, ScanMessage, TruthMessage
+from uwbslam_jax.session import MessageClocks
 from uwbslam_jax.settings import UwbSettings
 
 TRUTH_ROBOT, TRUTH_BEACON = "/ground_truth/robot", "/ground_truth/beacon/"
@@ -99,6 +100,7 @@ class LogReader:
         channels = self._recording.channels
         self.topics: dict[str, Role] = {channels[number].topic: role for number, role in self._roles.items()}
         self._warnings: list[str] = []
+        self._of_clocks: list[str] = []
         if uwb_topic is not None and "uwb" not in self._roles.values():
             self._warnings.append(f"no UWB topic: {'LiDAR' if 'scan' in self._roles.values() else 'odometry'} only")
         ranges = {number: decode for number, decode in self._decoders.items() if self._roles[number] == "uwb"}
@@ -110,7 +112,8 @@ class LogReader:
     @property
     def warnings(self) -> list[str]:
         options = self._options
-        return [*self._warnings, *options.scans.told.values(), *options.told, *names_told(options)]
+        told = [*options.scans.told.values(), *options.told, *names_told(options)]
+        return [*self._warnings, *told, *self._of_clocks]
 
     @property
     def robot_id(self) -> int:
@@ -133,14 +136,24 @@ class LogReader:
     def truth(self) -> Truth | None:
         """Where robot and beacons were, None where the recording has no truth of the robot; read through for it."""
         wanted = {number: decode for number, decode in self._decoders.items() if self._roles[number] == "truth"}
-        truths = [m for at, n, raw in self._recording.records(set(wanted)) for m in wanted[n](raw, at)]
-        poses = [m for m in truths if isinstance(m, TruthMessage)]
+        poses = [m for m in self._timed(MessageClocks(), wanted) if isinstance(m, TruthMessage)]
         return Truth.from_messages(poses) if any(m.node is None for m in poses) else None
 
     def __iter__(self) -> Iterator[Message]:
         self._options.dropped.clear()
-        for log_time, channel, data in self._recording.records(set(self._decoders)):
-            yield from self._decoders[channel](data, log_time)
+        clocks = MessageClocks(self._options.dropped)
+        self._of_clocks = []
+        yield from self._timed(clocks, self._decoders)
+        self._of_clocks = clocks.warnings
+
+    def _timed(self, clocks: MessageClocks, decoders: dict[int, Decoder]) -> Iterator[Message]:
+        """Messages of some channels, on one clock."""
+        topics = {number: self._recording.channels[number].topic for number in decoders}
+        for log_time, channel, data in self._recording.records(set(decoders)):
+            topic = topics[channel]
+            for message in decoders[channel](data, log_time):
+                yield from clocks.take(message, log_time, topic)
+        yield from clocks.flush()
 
 
 def choose_topics(

@@ -171,9 +171,9 @@ def range_taker(layout: Layout, topic: str, options: Options) -> Callable[[Any, 
     if layout.source == "@robot":
         options.names.setdefault("@robot", options.robot_id)  # no name of another node means this id
 
-    def take(message: Any, log_time: int, stamp_of: StampOf) -> list[Message]:
+    def take(message: Any, stamp_of: StampOf) -> list[Message]:
         found: list[Message] = []
-        stamp = stamp_of(message, log_time)
+        stamp = stamp_of(message, 0)
         for place in _places(lists, [message], 0):
             measured = float(get[layout.range](place))
             if layout.target == "@index" and not measured > 0.0:
@@ -238,7 +238,7 @@ def fast_range(options: Options) -> Callable[[bytes, int], list[Message]]:
                 raise ValueError("not plain CDR")
             sec, nanosec, length = heads[data[1]].unpack_from(data, 4)
             source, target, measured, *powers = tails[data[1]].unpack_from(data, 16 + (length + 3 & ~3))
-            stamp = sec * 1_000_000_000 + nanosec or log_time
+            stamp = sec * 1_000_000_000 + nanosec
         except (struct.error, IndexError, ValueError):
             options.dropped[RangeLost.MALFORMED] += 1
             return []

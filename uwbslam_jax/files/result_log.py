@@ -98,14 +98,19 @@ def _poses(result: Result, known: np.ndarray) -> Iterator[_Item]:
 
 
 def _beacons(result: Result, start: int) -> Iterator[_Item]:
-    """Beacons as known at each second, then the final ones with their ellipses."""
+    """Beacons as known at each second that has a frame, then the final ones with their ellipses."""
     if not len(result.stamps):
         return
     end = int(result.stamps[-1])
-    for stamp in range(start, end, BEACONS_PERIOD):
-        seconds = (stamp - start) * 1e-9
+    seconds = np.unique(
+        (result.stamps - start) // BEACONS_PERIOD
+    )  # not all between: a clock may have been set by years
+    for stamp in (start + seconds * BEACONS_PERIOD).tolist():
+        if stamp >= end:
+            break
+        passed = (stamp - start) * 1e-9
         tracks = sorted(result.beacon_tracks.items())
-        past = {number: int(np.searchsorted(track[:, 0], seconds, side="right")) for number, track in tracks}
+        past = {number: int(np.searchsorted(track[:, 0], passed, side="right")) for number, track in tracks}
         known = {number: track[past[number] - 1] for number, track in tracks if past[number]}
         if known:
             yield _Item(stamp, "/beacons", lambda s=stamp, known=known: _packed(_track_markers(s, known)))

@@ -128,7 +128,7 @@ def make_decoder(channel: Channel, role: Role, options: Options) -> Decoder:
 
     def decode(data: bytes, log_time: int) -> list[Message]:
         try:
-            return take(unpack(data), log_time, options)
+            return take(unpack(data), options)
         except _MALFORMED:
             options.dropped[malformed] += 1
             return []
@@ -197,7 +197,7 @@ def _range_decoder(channel: Channel, options: Options) -> Decoder:
             if take is None and (found := find_layout(fields_of_object(message))):
                 take = range_taker(found, channel.topic, options)
             if take is not None:
-                return take(message, log_time, _stamp)
+                return take(message, _stamp)
         except _MALFORMED:
             pass
         options.dropped[RangeLost.MALFORMED] += 1
@@ -263,23 +263,23 @@ def _is_our_range(channel: Channel) -> bool:
     return all(t in store.fielddefs and store.fielddefs[t][1] == STORE.fielddefs[own][1] for t, own in pairs)
 
 
-def _stamp(message: Any, log_time: int) -> int:
-    """Time of a message [ns]: its header's, or its own, or the log time where it has neither or zero."""
+def _stamp(message: Any, otherwise: int = 0) -> int:
+    """Time of a message [ns]: its header's, or its own; another where it has neither, or 0."""
     time = getattr(message, "header", message)
     time = getattr(time, "stamp", None) or getattr(time, "timestamp", None)
     if time is None:
-        return log_time
+        return otherwise
     nanosec = getattr(time, "nanosec", None)
-    return int(time.sec) * 1_000_000_000 + int(time.nsec if nanosec is None else nanosec) or log_time
+    return int(time.sec) * 1_000_000_000 + int(time.nsec if nanosec is None else nanosec) or otherwise
 
 
-_TAKE: dict[Role, Callable[[Any, int, Options], list[Message]]] = {
-    "scan": lambda message, log_time, options: options.scans.take(message, _stamp(message, log_time), options.dropped),
-    "odom": lambda message, log_time, options: [
+_TAKE: dict[Role, Callable[[Any, Options], list[Message]]] = {
+    "scan": lambda message, options: options.scans.take(message, _stamp(message), options.dropped),
+    "odom": lambda message, options: [
         found
         for part in odometry_parts(message)
-        for found in take_odometry(part, _stamp(part, log_time), options.dropped, options.told)
+        for found in take_odometry(part, _stamp(part), options.dropped, options.told)
     ],
-    "truth": lambda message, log_time, _: take_truth(message, _stamp(message, log_time)),
+    "truth": lambda message, _: take_truth(message, _stamp(message)),
 }
 """From an unpacked message to its measurements [role -> function]."""

@@ -38,6 +38,7 @@ _LIMITS = {
     "lidar.max_beams": (1, 100_000),
     "map.levels": (1, 5),
     "uwb.bias_scale": (-0.5, 1.0),
+    "uwb.latency": (-5.0, 5.0),
 }
 """Least and greatest value of a setting [its unit]: ids have 32 bits; beyond the others lie mistakes."""
 

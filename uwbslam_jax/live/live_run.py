@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from array import array
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,8 +23,8 @@ from uwbslam_jax.live.devices import Devices
 from uwbslam_jax.live.message_queue import Inbox
 from uwbslam_jax.live.publisher import Publisher
 from uwbslam_jax.live.recorder import LogRecorder
-from uwbslam_jax.measurements import ScanMessage
-from uwbslam_jax.session import Facts, Saved, Update, saved_state
+from uwbslam_jax.measurements import Message, ScanMessage
+from uwbslam_jax.session import Facts, MessageClocks, Saved, Update, saved_state
 from uwbslam_jax.web import LivePage, Status
 
 _MANY_LOST = 50
@@ -80,6 +80,8 @@ class LiveRun:
         self._recorder = LogRecorder(recording, slam.settings)
         self._queue = Inbox(self._recorder.record)
         self._recorder.tick = lambda: self._queue.thin(host_time())
+        self._clocks = MessageClocks()
+        self._arrived: deque[tuple[np.ndarray, int]] = deque()  # scans on their way through the clocks
         self._scan_received: int | None = None
         self._latency_ms = array("f")
         self._beams: set[int] = set()
@@ -101,7 +103,8 @@ class LiveRun:
             self._devices.close()
             while self._turn(0.0):
                 pass
-            result = self._slam.finish(Facts(dropped=self._dropped()))
+            self._take(self._clocks.flush())
+            result = self._slam.finish(Facts(warnings=self._clocks.warnings, dropped=self._dropped()))
         finally:
             self._devices.close()
             self._recorder.close()
@@ -120,11 +123,23 @@ class LiveRun:
             self._refresh()
         if arrival is None:
             return False
-        if isinstance(arrival.message, ScanMessage):
-            self._scan_received = arrival.received
-            self._beams.add(arrival.message.ranges.size)
-        self._slam.add(arrival.message)
+        message = arrival.message
+        topics = self._slam.settings.uwb.topic, self._slam.settings.lidar.topic
+        if isinstance(message, ScanMessage):
+            self._arrived.append((message.ranges, arrival.received))
+            self._beams.add(message.ranges.size)
+        # with the times and topics of the recording, so that it gives the same again
+        self._take(self._clocks.take(message, arrival.log_time, topics[isinstance(message, ScanMessage)]))
         return True
+
+    def _take(self, timed: list[Message]) -> None:
+        """Messages on one clock go in."""
+        for message in timed:
+            if isinstance(message, ScanMessage):
+                ranges = None
+                while ranges is not message.ranges:  # one that was dropped is passed over
+                    ranges, self._scan_received = self._arrived.popleft()
+            self._slam.add(message)
 
     def _publish(self, update: Update) -> None:
         """Called with each update, before the host looks at what it means for start-up and beacons."""
@@ -162,6 +177,7 @@ class LiveRun:
         found |= {line: line for line in self._lasting(self._devices.troubles())}
         if self._recorder.failure:
             found["recording"] = f"recording: {self._recorder.failure}"
+        found |= {line: line for line in self._clocks.warnings}
         found |= self._slam.runner.warnings(dropped, _MANY_LOST)
         for subject, line in found.items():
             if subject not in self.told:
@@ -198,7 +214,7 @@ class LiveRun:
         process.give_back()
 
     def _dropped(self) -> Counter[str]:
-        counts: Counter[str] = Counter(self._queue.dropped)
+        counts: Counter[str] = self._queue.dropped + self._clocks.dropped
         for source in self._devices.sources.values():
             counts.update({why: n for why, n in source.counts.items() if why not in _NO_LOSS})
         return counts

@@ -58,6 +58,7 @@ from uwbslam_jax.numerics.se2_host import (
     wrapped as wrapped,
 )
 from uwbslam_jax.numerics.sparse_least_squares import (
+    SingularError as SingularError,
     Sink as Sink,
     cost_of as cost_of,
     covariance as covariance,

@@ -20,8 +20,14 @@ _BLOCK = 2048
 """So many rows are put together at a time."""
 _FEW = 300
 """Up to so many unknowns the normal equations are dense."""
+_RIDGE = 1e-6
+"""Share of the diagonal [1], and prior information [1/unit^2], that make singular equations solvable: a kilometre."""
 _LARGE = 500_000
 """Entries of normal equations that take memory worth the milliseconds of handing it back: some 3000 keyframes."""
+
+
+class SingularError(ArithmeticError):
+    """Normal equations that have no solution."""
 
 
 @runtime_checkable
@@ -58,7 +64,7 @@ class Normal(NamedTuple):
         return self.A.diagonal()
 
     def solved(self, diagonal: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Solution for b (U,) or (U, C) with another diagonal (U,); A has it from then on."""
+        """Solution for b (U,) or (U, C) with another diagonal (U,); A has it from then on. Raises SingularError."""
         self.A.setdiag(diagonal)
         return _factor(self.A.T).solve(b)
 
@@ -94,9 +100,12 @@ class Dense:
         return self.A.diagonal().copy()
 
     def solved(self, diagonal: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Solution for b (U,) or (U, C) with another diagonal (U,); A has it from then on."""
+        """Solution for b (U,) or (U, C) with another diagonal (U,); A has it from then on. Raises SingularError."""
         np.fill_diagonal(self.A, diagonal)
-        return np.linalg.solve(self.A, b)
+        try:
+            return np.linalg.solve(self.A, b)
+        except np.linalg.LinAlgError as error:
+            raise SingularError(str(error)) from None
 
 
 class Rows:
@@ -144,8 +153,11 @@ def elimination(i: np.ndarray, j: np.ndarray, count: int) -> np.ndarray:
 
 
 def _factor(A: sparse.csc_array, order: str = "NATURAL") -> SuperLU:
-    """Factorisation of a symmetric positive definite matrix."""
-    return splu(A, permc_spec=order, diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    """Factorisation of a symmetric positive definite matrix. Raises SingularError."""
+    try:
+        return splu(A, permc_spec=order, diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    except RuntimeError as error:
+        raise SingularError(str(error)) from None
 
 
 def minimise(
@@ -163,8 +175,11 @@ def minimise(
     for _ in range(moves):
         normal = normal or _linearised(fill, x, rank)
         diagonal = normal.diagonal() if diagonal is None else diagonal
-        moved = x - normal.solved(diagonal + damping * (diagonal + 1e-9), normal.b)[rank]
-        new_cost, there = _costed(fill, moved, rank)
+        try:
+            moved = x - normal.solved(diagonal + damping * (diagonal + 1e-9), normal.b)[rank]
+            new_cost, there = _costed(fill, moved, rank)
+        except SingularError:  # what is not tied to anything stays, and with more damping the rest is solved
+            moved, new_cost, there = x, np.inf, None
         if new_cost < cost:
             gain, x, cost, normal, diagonal = cost - new_cost, moved, new_cost, there, None
             damping = max(damping / 10, 1e-12)
@@ -178,11 +193,19 @@ def minimise(
 
 
 def covariance(fill: Fill, x: np.ndarray, rank: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """(C, C) covariance at x (U,) of some unknowns (C,), all others free; fill and rank as in `minimise`."""
+    """(C, C) covariance at x (U,) of some unknowns (C,), all others free; fill and rank as in `minimise`.
+
+    Raises:
+      SingularError: there is none, even where the unknowns are known a little beforehand.
+    """
     normal = _linearised(fill, x, rank)
     unit = np.zeros((len(x), len(columns)))
     unit[rank[columns], np.arange(len(columns))] = 1.0
-    return normal.solved(normal.diagonal() + 1e-9, unit)[rank[columns]]
+    diagonal = normal.diagonal()
+    try:
+        return normal.solved(diagonal + 1e-9, unit)[rank[columns]]
+    except SingularError:
+        return normal.solved(diagonal * (1.0 + _RIDGE) + _RIDGE, unit)[rank[columns]]
 
 
 def cost_of(fill: Fill, x: np.ndarray) -> float:

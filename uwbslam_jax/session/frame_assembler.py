@@ -10,6 +10,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections import Counter, deque
 from collections.abc import Collection, Iterable, Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -47,6 +48,8 @@ _ODOMETRY_EVERY_S = 0.08
 """Frames made by the odometry are at least so far apart."""
 _ODOMETRY_LAGS_S = 15.0
 """Ranges wait this long for odometry that has come before."""
+_LONGEST_S = 3600.0
+"""No time between two frames is taken for longer: a clock that was set by years does not make beacons wander."""
 _ODOMETRY_HOLD_S = 0.3
 """The last odometry is extrapolated at most this far."""
 _ROUNDING = 1e-6
@@ -73,6 +76,8 @@ class FrameAssembler:
         self.wheels = OdometryTrack()
         self.odometry_used = False
         self._settings = settings
+        self._max_range = settings.uwb.max_range
+        self._latency = round(settings.uwb.latency * 1e9)
         self._max_ranges = max_ranges
         self._seldom: Counter[int] = Counter()  # ids without a slot
         self._ranges: list[RangeMessage] = []
@@ -133,20 +138,23 @@ class FrameAssembler:
         return [*waiting, self._close(scan.stamp, ready, scan)]
 
     def _add_range(self, message: RangeMessage) -> list[StampedFrame]:
-        if not (np.isfinite(message.range) and 0.0 < message.range <= self._settings.uwb.max_range):
+        if not 0.0 < message.range <= self._max_range:
             self.dropped[RangeLost.IMPOSSIBLE] += 1
             return []
+        if self._latency:
+            message = replace(message, stamp=message.stamp - self._latency)
         if message.source == message.target:
             self.dropped[RangeLost.SELF] += 1
             return []
-        pair = (min(message.source, message.target), max(message.source, message.target))
+        a, b = message.source, message.target
+        pair = (a, b) if a < b else (b, a)
         if message.stamp <= self._newest_range.get(pair, -1):
             self.dropped[RangeLost.STAMP] += 1
             return []
-        if self._last is not None and message.stamp <= self._last - int(0.5e9):
+        if self._last is not None and message.stamp <= self._last - int(0.5e9) - self._latency:
             self.dropped[RangeLost.LATE] += 1
             return []
-        if self._slot(message.source) is None or self._slot(message.target) is None:
+        if (a not in self.slots and self._slot(a) is None) or (b not in self.slots and self._slot(b) is None):
             self.dropped[RangeLost.NO_SLOT] += 1
             return []
         self.used[Sensor.RANGE] += 1
@@ -237,7 +245,7 @@ class FrameAssembler:
         return min(max(_BLIND_SCANS * float(np.median(self._intervals)) / 1e9, _BLIND_S), _SCANLESS_S)
 
     def _close(self, stamp: int, ranges: list[RangeMessage], scan: ScanMessage | None) -> StampedFrame:
-        dt = 0.0 if self._last is None else (stamp - self._last) / 1e9
+        dt = 0.0 if self._last is None else min((stamp - self._last) / 1e9, _LONGEST_S)
         odometry = self._increment(stamp)
         if len(ranges) > self._max_ranges:
             self.dropped[RangeLost.FRAME_FULL] += len(ranges) - self._max_ranges

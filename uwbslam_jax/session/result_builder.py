@@ -26,6 +26,13 @@ _NO_TRACK = "no scan and no odometry: there is no track, the map is empty"
 """Warning [text]."""
 _RELATIVE = "the robot has not moved: beacons are placed among themselves, rotation and reflection are arbitrary"
 """Warning [text]; said where scans, odometry or the ranges themselves show it, see Runner.relative."""
+_UNSOLVED = "the run could not be solved as a whole ({}): track and beacons are those published along the way"
+"""Warning [text], with what the solver said."""
+_LATE = (
+    "ranges are stamped {0:.2f} s {2} (standard deviation {1:.2f} s): the final track and beacons take that into "
+    "account; with --uwb.latency {3:.2f} those along the way do so too"
+)
+"""Warning [text], with the time, its standard deviation [s], which way, and the setting that mends it [s]."""
 
 
 @dataclass
@@ -71,6 +78,8 @@ def to_result(session: Session, facts: Facts) -> Result:
     told += [] if facts.relative is None else [_RELATIVE]
     told += [] if beacons else _unplaced(session, facts)
     told += _biases(session)
+    told += _latency(session)
+    told += [_UNSOLVED.format(session.back_end.failure)] if session.back_end.failure else []
     facts = dataclasses.replace(facts, warnings=[*facts.warnings, *told])
     stamps = history.stamps.values[at]
     start = int(stamps[0]) if len(stamps) else 0
@@ -137,6 +146,15 @@ def _biases(session: Session) -> list[str]:
     told = ", ".join(f"node {node} {bias:+.2f} m" for node, bias in sorted(found.items()))
     advice = "set uwb.bias if the radios are known"
     return [f"ranges are biased: {told} were solved from the run; {advice}"] if session.biased else []
+
+
+def _latency(session: Session) -> list[str]:
+    """A warning where the stamps of the ranges were found to be late, or early."""
+    found = session.back_end.latency
+    if found is None:
+        return []
+    setting = session.settings.uwb.latency + found.late
+    return [_LATE.format(abs(found.late), found.sigma, "late" if found.late > 0 else "early", setting)]
 
 
 def _beacons(session: Session, ids: dict[int, int]) -> list[BeaconEstimate]:

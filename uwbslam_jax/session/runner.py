@@ -19,6 +19,7 @@ from uwbslam_jax.reasons import Sensor
 from uwbslam_jax.result import Result, RunStatus
 from uwbslam_jax.session.frame_assembler import FrameAssembler
 from uwbslam_jax.session.losses import losses
+from uwbslam_jax.session.message_clocks import MessageClocks
 from uwbslam_jax.session.result_builder import Facts, to_result
 from uwbslam_jax.session.saved_state import Locator, Saved
 from uwbslam_jax.session.session import CONTROL_EVERY, Session
@@ -59,6 +60,7 @@ class Runner:
         """
         self.session = Session(settings)
         self.truths = Column(dtype=TRUTH)
+        self._clocks = MessageClocks()
         self._assembler = FrameAssembler(settings, self.session.config.max_ranges)
         self._group = 1 if online else CONTROL_EVERY
         self._clock = clock
@@ -70,7 +72,16 @@ class Runner:
         self.not_located: Counter[str] = Counter()
 
     def add(self, message: Message) -> list[Update]:
-        """Takes in a message; the updates that it leads to, none in batch mode."""
+        """Takes in a message; the updates that it leads to, none in batch mode.
+
+        Those of a recording or a device are on one clock already; of others only the stamps tell, see MessageClocks.
+        """
+        timed = self._clocks.take(message, None, type(message).__name__)
+        if len(timed) == 1:
+            return self._add(timed[0])
+        return list(itertools.chain.from_iterable(map(self._add, timed)))
+
+    def _add(self, message: Message) -> list[Update]:
         if isinstance(message, TruthMessage):
             self.truths.append(truth_row(message))
             return []
@@ -94,7 +105,8 @@ class Runner:
 
     def finish(self) -> list[Update]:
         """The updates of what still waits."""
-        updates = [update for frame in self._assembler.flush() for update in self._take(frame)]
+        updates = list(itertools.chain.from_iterable(map(self._add, self._clocks.flush())))
+        updates += [update for frame in self._assembler.flush() for update in self._take(frame)]
         updates += self._step()
         self.session.finish()
         return updates
@@ -104,10 +116,11 @@ class Runner:
 
         While the robot waits for motion the beacons are those of the relative geometry, their status RELATIVE.
         """
-        dropped = facts.dropped + self._assembler.dropped + self.not_located
+        dropped = facts.dropped + self._clocks.dropped + self._assembler.dropped + self.not_located
         wheels = [*self._assembler.wheels.told(), *self.session.odometry.told()]
         own = [*self._assembler.warnings, *self._assembler.missing()]
-        warnings = list(dict.fromkeys([*facts.warnings, *own, *wheels]))
+        # what the stamps alone tell may have been told of the log already
+        warnings = list(dict.fromkeys([*facts.warnings, *self._clocks.warnings, *own, *wheels]))
         told = dataclasses.replace(
             facts,
             warnings=warnings,
