@@ -85,7 +85,10 @@ _RANGES_ONLY = r"UwbRange|LinktrackNodeframe[23]|.*RangeStamped"
 """Types that are ranges between nodes and nothing else, taken before others that may be [regex]."""
 _RADIO = r"(?i).*(uwb|anchor|beacon|tag|dwm|dw[13]000|decawave|pozyx|linktrack|twr).*"
 """What the topic or type of a radio's ranges to one node says: sonars have the same messages [regex]."""
-_MALFORMED = (SerdeError, struct.error, AttributeError, TypeError, ValueError, LookupError, ArithmeticError)
+_MALFORMED = (
+    *(SerdeError, struct.error, AttributeError, TypeError, ValueError, LookupError, ArithmeticError),
+    RecursionError,
+)
 """What decoding damaged bytes raises [exceptions]: rosbags passes on those of struct, numpy and the builtins."""
 
 
@@ -248,7 +251,7 @@ def _store_of(channel: Channel) -> tuple[Typestore, str]:
         known = {key: value for key, value in types.items() if key not in store.fielddefs}
         store.register(known)
         store.get_msgdef(name)
-    except (TypesysError, KeyError, ValueError, SyntaxError) as error:
+    except (TypesysError, KeyError, ValueError, SyntaxError, RecursionError) as error:
         reason = " ".join([type(error).__name__, *str(error).splitlines()[:1]])
         raise LogError(f"topic {channel.topic}: unreadable definition of {channel.schema!r}: {reason}") from None
     return store, name
