@@ -17,9 +17,8 @@ S = 1_000_000_000
 
 
 def messages(seconds: int = 30) -> list[Message]:
-    scans = [
-        ScanMessage(T0 + k * S // 10, 0.0, 0.1, 0.0, 0.1, 30.0, np.ones(900, np.float32)) for k in range(10 * seconds)
-    ]
+    walls = np.linspace(1.0, 4.0, 900, dtype=np.float32)
+    scans = [ScanMessage(T0 + k * S // 10, 0.0, 0.005, 0.0, 0.1, 30.0, walls) for k in range(10 * seconds)]
     ranges = [RangeMessage(T0 + 5 + k * S // 20, 0, 1 + k % 3, 2.0) for k in range(20 * seconds)]
     return sorted([*scans, *ranges], key=lambda m: m.stamp)
 
