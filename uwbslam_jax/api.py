@@ -19,7 +19,7 @@ from uwbslam_jax import evaluation, result as data
 from uwbslam_jax.errors import LogError, UsageError
 from uwbslam_jax.estimator import CompileClock
 from uwbslam_jax.evaluation import Truth
-from uwbslam_jax.files import LogReader, LogSummary, inspect_log, mounting, read_run, settings_file, write_result
+from uwbslam_jax.files import LogSummary, Recording, inspect_log, mounting, read_run, settings_file, write_result
 from uwbslam_jax.measurements import Message, ScanMessage, TruthMessage
 from uwbslam_jax.result import MapImage, RunStatus
 from uwbslam_jax.session import PEEK_SCANS, Facts, Runner, Saved, Update, fit_beams, saved_state
@@ -95,13 +95,13 @@ class Result(data.Result):
         return axes
 
 
-Source = Paths | LogReader | Simulation | Iterable[Message]
+Source = Paths | Recording | Simulation | Iterable[Message]
 
 
-def read(path: Paths, settings: Settings | None = None) -> LogReader:
+def read(path: Paths, settings: Settings | None = None) -> Recording:
     """Opens a recording: an iterable of messages, with its topics, warnings and truth. Raises LogError."""
     s = settings or Settings()
-    return LogReader(
+    return Recording(
         path,
         scan_topic=s.lidar.topic,
         uwb_topic=None if s.filter.lidar_only else s.uwb.topic,
@@ -147,7 +147,7 @@ def run(
     """
     begin = time.perf_counter()
     messages, settings = _opened(source, settings)
-    reader = messages if isinstance(messages, LogReader) else None
+    reader = messages if isinstance(messages, Recording) else None
     if reader is not None and "uwb" not in reader.topics.values():
         settings = dataclasses.replace(settings, filter=dataclasses.replace(settings.filter, lidar_only=True))
     settings = fit_beams(settings, messages)
@@ -312,7 +312,7 @@ def load_truth(path: Path) -> Truth:
     try:
         if path.suffix == ".npz":
             return Truth.load(path)
-        truth = LogReader(path, scan_topic=None, uwb_topic=None, odom_topic=None).truth
+        truth = Recording(path, scan_topic=None, uwb_topic=None, odom_topic=None).truth
     except LogError:
         raise
     except (ValueError, zipfile.BadZipFile) as error:
@@ -345,11 +345,11 @@ def tune(
     """
     wanted = settings_file.check(settings or Settings())
     check_request(tuple(params), wanted)
-    one = isinstance(recordings, str | Path | LogReader | Simulation) or _are_messages(recordings)
+    one = isinstance(recordings, str | Path | Recording | Simulation) or _are_messages(recordings)
     logs = []
     for source in cast(Sequence[Source], [recordings] if one else recordings):
         messages, settings = _opened(source, settings)
-        name = messages.name if isinstance(messages, LogReader) else f"recording {len(logs) + 1}"
+        name = messages.name if isinstance(messages, Recording) else f"recording {len(logs) + 1}"
         kept = list(messages)
         truths = [m for m in kept if isinstance(m, TruthMessage)]
         known = any(m.node is None for m in truths)
@@ -371,14 +371,14 @@ def _are_messages(source: object) -> TypeGuard[Sequence[Message]]:
     return isinstance(source, Sequence) and len(source) > 0 and isinstance(source[0], Message)
 
 
-def _opened(source: Source, settings: Settings | None) -> tuple[LogReader | Iterable[Message], Settings]:
+def _opened(source: Source, settings: Settings | None) -> tuple[Recording | Iterable[Message], Settings]:
     """Messages that can be iterated over again, and the settings for them, with the mounting that a recording tells."""
     if settings is None:
         settings = source.settings if isinstance(source, Simulation) else Settings()
     settings_file.check(settings)
     if isinstance(source, str | Path | Sequence) and not _are_messages(source):
         source = read(cast(Paths, source), settings)
-    if isinstance(source, LogReader):
+    if isinstance(source, Recording):
         settings = dataclasses.replace(settings, robot=dataclasses.replace(settings.robot, id=source.robot_id))
         return source, mounting.mounted(settings, source.mounting)
     if isinstance(source, Simulation) or _are_messages(source):

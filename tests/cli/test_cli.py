@@ -17,7 +17,7 @@ from uwbslam_jax.__main__ import COMMANDS, main
 from uwbslam_jax.api import Result, run
 from uwbslam_jax.cli import commands
 from uwbslam_jax.files import settings_file
-from uwbslam_jax.files.mcap_log import LogReader, LogWriter
+from uwbslam_jax.files.mcap_log import LogWriter, Recording
 from uwbslam_jax.files.run_folder import read_run
 from uwbslam_jax.measurements import Message, RangeMessage, ScanMessage, TruthMessage
 from uwbslam_jax.session.result_builder import Facts, to_result
@@ -260,7 +260,7 @@ class TestSimulate:
         assert settings_file.load_settings(path.with_suffix(".toml")) == settings_file.from_dict(
             settings_overrides(made)
         )
-        assert sum(isinstance(m, ScanMessage) for m in LogReader(path)) == 10
+        assert sum(isinstance(m, ScanMessage) for m in Recording(path)) == 10
 
     def test_defaults_need_none(self, tmp_path: Path) -> None:
         path = tmp_path / "made.mcap"

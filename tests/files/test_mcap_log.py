@@ -19,7 +19,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from uwbslam_jax.errors import LogError
 from uwbslam_jax.files import log_summary, mcap_container, ros_types
-from uwbslam_jax.files.mcap_log import LogReader, LogWriter
+from uwbslam_jax.files.mcap_log import LogWriter, Recording
 from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, ScanMessage, TruthMessage
 from uwbslam_jax.settings import UwbSettings
 
@@ -115,13 +115,13 @@ class TestRoundTrip:
         message = RangeMessage(stamp, source, target, distance, receive, first)
         path = write_log(tmp_path_factory.mktemp("log") / "a.mcap", [scan(stamp), message])
         wanted: list[Message] = [] if source == target else [message]
-        assert_same([m for m in LogReader(path) if isinstance(m, RangeMessage)], wanted)
+        assert_same([m for m in Recording(path) if isinstance(m, RangeMessage)], wanted)
 
     @settings(max_examples=20)
     @given(stamps, st.lists(st.floats(width=32), min_size=1, max_size=30, unique=True), increments, floats32)
     def test_scan(self, tmp_path_factory: Any, stamp: int, ranges: list[float], increment: float, angle: float) -> None:
         message = ScanMessage(stamp, angle, increment, 0.5, 0.25, 12.0, np.array(ranges, np.float32))
-        assert_same(list(LogReader(write_log(tmp_path_factory.mktemp("log") / "a.mcap", [message]))), [message])
+        assert_same(list(Recording(write_log(tmp_path_factory.mktemp("log") / "a.mcap", [message]))), [message])
 
     @settings(max_examples=20)
     @given(stamps, floats, floats, st.floats(-3.14, 3.14), ids)
@@ -134,14 +134,14 @@ class TestRoundTrip:
             TruthMessage(stamp, None, x, y, yaw),
             TruthMessage(stamp, node, x, y),
         ]
-        reader = LogReader(write_log(tmp_path_factory.mktemp("log") / "a.mcap", messages))
+        reader = Recording(write_log(tmp_path_factory.mktemp("log") / "a.mcap", messages))
         assert_same(list(reader), messages)
         assert set(reader.topics.values()) == {"scan", "odom", "truth"}
 
     def test_a_reader_may_be_iterated_again(self, tmp_path: Path) -> None:
         messages = log_messages()
         bad = [RangeMessage(T0, 0, 1, -1.0)]
-        reader = LogReader(write_log(tmp_path / "a.mcap", [*bad, *messages]))
+        reader = Recording(write_log(tmp_path / "a.mcap", [*bad, *messages]))
         for _ in range(2):
             assert_same(list(reader), messages)
             assert reader.dropped.total() == 1
@@ -153,14 +153,14 @@ class TestRoundTrip:
         with LogWriter(tmp_path / "a.mcap") as writer:
             writer.write(scan(T0 + 50), log_time=T0 + 200)
             writer.write(RangeMessage(T0 + 90, 0, 1, 1.0), log_time=T0 + 100)
-        assert [m.stamp for m in LogReader(tmp_path / "a.mcap")] == [T0 + 90, T0 + 50]
+        assert [m.stamp for m in Recording(tmp_path / "a.mcap")] == [T0 + 90, T0 + 50]
 
     def test_duplicates_and_stamps_out_of_order_are_kept(self, tmp_path: Path) -> None:
         messages: list[Message] = [scan(T0), scan(T0)]
         with LogWriter(tmp_path / "a.mcap") as writer:
             for index, message in enumerate([*messages, scan(T0 - 5)]):
                 writer.write(message, log_time=T0 + index)
-        assert [m.stamp for m in LogReader(tmp_path / "a.mcap")] == [T0, T0, T0 - 5]
+        assert [m.stamp for m in Recording(tmp_path / "a.mcap")] == [T0, T0, T0 - 5]
 
     def test_other_topics(self, tmp_path: Path) -> None:
         topics: dict[str, Any] = {"scan_topic": "/front", "uwb_topic": "/radio", "odom_topic": "/wheels"}
@@ -168,7 +168,7 @@ class TestRoundTrip:
             for message in log_messages(3):
                 writer.write(message)
         for given_topics in (topics, {}):  # named, and found by their types
-            reader = LogReader(tmp_path / "a.mcap", **given_topics)
+            reader = Recording(tmp_path / "a.mcap", **given_topics)
             assert reader.topics == {"/front": "scan", "/radio": "uwb", "/wheels": "odom"}
             assert_same(list(reader), log_messages(3))
 
@@ -239,24 +239,24 @@ class TestBrokenFiles:
         path = tmp_path / "a.mcap"
         path.write_bytes(content)
         with pytest.raises(LogError, match=says) as caught:
-            LogReader(path)
+            Recording(path)
         assert str(path) in str(caught.value)
         assert "\n" not in str(caught.value)
 
     def test_missing(self, tmp_path: Path) -> None:
         with pytest.raises(LogError, match=r"absent\.mcap: no such file"):
-            LogReader(tmp_path / "absent.mcap")
+            Recording(tmp_path / "absent.mcap")
 
     def test_folders(self, tmp_path: Path) -> None:
         with pytest.raises(LogError, match=r"without a \.mcap, \.db3 or \.bag file"):
-            LogReader(tmp_path)
+            Recording(tmp_path)
         (tmp_path / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
         write_log(tmp_path / "bag_0.mcap", log_messages(2))
-        assert_same(list(LogReader(tmp_path)), log_messages(2))
+        assert_same(list(Recording(tmp_path)), log_messages(2))
         write_log(tmp_path / "other_1.mcap", log_messages(2))
         with pytest.raises(LogError, match=r"name those that are: bag_0\.mcap, other_1\.mcap"):
-            LogReader(tmp_path)
-        assert_same(list(LogReader([tmp_path / "other_1.mcap"])), log_messages(2))
+            Recording(tmp_path)
+        assert_same(list(Recording([tmp_path / "other_1.mcap"])), log_messages(2))
 
     @pytest.fixture
     def split(self, tmp_path: Path) -> Path:
@@ -274,22 +274,22 @@ class TestBrokenFiles:
 
     def test_a_bag_of_several_files_is_one_recording(self, split: Path) -> None:
         files = [split / "bag_0.mcap", split / "bag_1.mcap"]
-        one = LogReader(split / "whole")
+        one = Recording(split / "whole")
         for source in (split, files):
-            reader = LogReader(source)
+            reader = Recording(source)
             assert_same(list(reader), list(one))
             assert (reader.message_count, reader.duration) == (one.message_count, one.duration)
             assert reader.truncated is None
-        assert LogReader(files).name == f"{files[0]} and 1 more"
+        assert Recording(files).name == f"{files[0]} and 1 more"
         told, whole = log_summary.inspect_log(split), log_summary.inspect_log(split / "whole")
         assert [(t.name, t.role, t.count) for t in told.topics] == [(t.name, t.role, t.count) for t in whole.topics]
 
     def test_a_bag_whose_first_file_breaks_goes_on_with_the_second(self, split: Path) -> None:
         first, second = split / "bag_0.mcap", split / "bag_1.mcap"
         first.write_bytes(first.read_bytes()[: first.stat().st_size * 2 // 3])
-        reader = LogReader(split)
+        reader = Recording(split)
         assert str(reader.truncated).startswith("bag_0.mcap: recording breaks after ")
-        assert {m.stamp for m in LogReader(second)} <= {m.stamp for m in reader}
+        assert {m.stamp for m in Recording(second)} <= {m.stamp for m in reader}
 
     @pytest.mark.parametrize(
         ("metadata", "told"),
@@ -303,12 +303,12 @@ class TestBrokenFiles:
     def test_bags_that_cannot_be_read(self, split: Path, metadata: str, told: str) -> None:
         (split / "metadata.yaml").write_text(f"rosbag2_bagfile_information: {metadata}\n")
         with pytest.raises(LogError, match=told) as error:
-            LogReader(split)
+            Recording(split)
         assert "\n" not in str(error.value)
 
     def test_no_messages_at_all(self, tmp_path: Path) -> None:
         with pytest.raises(LogError, match="there are no topics"):
-            LogReader(write_raw(tmp_path / "a.mcap", {}, []))
+            Recording(write_raw(tmp_path / "a.mcap", {}, []))
 
     @pytest.mark.parametrize(
         ("compression", "chunked"),
@@ -339,7 +339,7 @@ class TestBrokenFiles:
             cut = tmp_path / "cut.mcap"
             cut.write_bytes(whole[:size])
             try:
-                reader = LogReader(cut)
+                reader = Recording(cut)
             except LogError as error:
                 said.add(re.sub(r"[0-9]+", "N", str(error).removeprefix(f"{cut}: ")))
                 continue
@@ -359,8 +359,8 @@ class TestBrokenFiles:
     def test_a_cut_tells_when(self, tmp_path: Path) -> None:
         path = write_log(tmp_path / "a.mcap", log_messages())
         path.write_bytes(path.read_bytes()[:-20])
-        assert LogReader(path).truncated is not None
-        assert str(LogReader(path).truncated).startswith("recording breaks after 3.9 s (byte ")
+        assert Recording(path).truncated is not None
+        assert str(Recording(path).truncated).startswith("recording breaks after 3.9 s (byte ")
 
     def test_a_file_never_finished(self, tmp_path: Path) -> None:
         """A recorder that was killed: chunks, but no end, and zeros where the disk had been reserved."""
@@ -369,7 +369,7 @@ class TestBrokenFiles:
         path = write_raw(tmp_path / "a.mcap", {"/scan": ros_channel(schema)}, many, finish=False, chunk_size=1000)
         for tail in (b"", bytes(1000)):
             path.write_bytes(path.read_bytes() + tail)
-            reader = LogReader(path)
+            reader = Recording(path)
             assert len(list(reader)) >= 40
             assert reader.truncated is not None
 
@@ -384,7 +384,7 @@ class TestBrokenFiles:
         (_, count), (end, second), *_ = chunk_ends(tmp_path / "a.mcap")
         content[end - 200] ^= 0xFF  # inside the compressed bytes of the second chunk
         (tmp_path / "a.mcap").write_bytes(content if with_summary else content[:-30])
-        reader = LogReader(tmp_path / "a.mcap")
+        reader = Recording(tmp_path / "a.mcap")
         assert second > 0
         assert_same(list(reader), messages[:count])
         assert "recording breaks after 0.0 s (byte" in str(reader.truncated)
@@ -396,7 +396,7 @@ class TestBrokenFiles:
         (end, count), *_ = chunk_ends(path)
         content[end : end + 9] = struct.pack("<BQ", 5, 2**62)
         path.write_bytes(content)
-        reader = LogReader(path)
+        reader = Recording(path)
         assert len(list(reader)) == count
         assert f"(byte {end} of" in str(reader.truncated)
 
@@ -415,7 +415,7 @@ class TestBrokenFiles:
             for at in rng.integers(8, len(whole), rng.integers(1, 8)):
                 content[at] = rng.integers(256)
             path.write_bytes(content)
-            for read in (lambda: list(LogReader(path)), lambda: str(log_summary.inspect_log(path))):
+            for read in (lambda: list(Recording(path)), lambda: str(log_summary.inspect_log(path))):
                 try:
                     read()
                 except LogError as error:
@@ -430,7 +430,7 @@ class TestBrokenFiles:
         path = write_raw(
             tmp_path / "a.mcap", {"/scan": ros_channel(schema)}, [("/scan", t, data) for t in times], chunk_size=500
         )
-        found = [record.log_time for record in mcap_container.Recording(path).records()]
+        found = [record.log_time for record in mcap_container.McapFile(path).records()]
         assert found == sorted(times)
 
 
@@ -457,17 +457,17 @@ class TestTopics:
     def test_no_scan_topic(self, tmp_path: Path) -> None:
         path = write_log(tmp_path / "a.mcap", [TruthMessage(T0, None, 0.0, 0.0, 0.0)])
         with pytest.raises(LogError, match=r"no scan topic .*/ground_truth/robot \(geometry_msgs/msg/PoseStamped\)"):
-            LogReader(path)
-        assert len(list(LogReader(path, scan_topic=None))) == 1
+            Recording(path)
+        assert len(list(Recording(path, scan_topic=None))) == 1
 
     def test_ranges_or_odometry_alone_are_read(self, tmp_path: Path) -> None:
         path = write_log(tmp_path / "a.mcap", [RangeMessage(T0, 0, 1, 1.0)])
-        assert LogReader(path).warnings == []
+        assert Recording(path).warnings == []
         path = write_log(tmp_path / "b.mcap", [OdometryMessage(T0, 0.0, 0.0, 0.0)])
-        assert LogReader(path).warnings == ["no UWB topic: odometry only"]
+        assert Recording(path).warnings == ["no UWB topic: odometry only"]
 
     def test_no_uwb_topic(self, tmp_path: Path) -> None:
-        reader = LogReader(write_log(tmp_path / "a.mcap", [scan(T0)]))
+        reader = Recording(write_log(tmp_path / "a.mcap", [scan(T0)]))
         assert reader.warnings == ["no UWB topic: LiDAR only"]
         assert_same(list(reader), [scan(T0)])
 
@@ -476,62 +476,62 @@ class TestTopics:
         channels = {topic: SCAN_CHANNEL for topic in ("/front", "/rear", "/never")}
         path = write_raw(tmp_path / "a.mcap", channels, [("/front", T0, data), ("/rear", T0, data)])
         with pytest.raises(LogError, match=r"several scan topics: /front, /rear; choose with --lidar\.topic"):
-            LogReader(path)
-        assert len(list(LogReader(path, scan_topic="/rear"))) == 1
+            Recording(path)
+        assert len(list(Recording(path, scan_topic="/rear"))) == 1
 
     def test_a_silent_topic_is_no_rival(self, tmp_path: Path) -> None:
         _, data = ros_types.encode(scan(T0))
         channels = {topic: SCAN_CHANNEL for topic in ("/front", "/never")}
         path = write_raw(tmp_path / "a.mcap", channels, [("/front", T0, data)])
-        assert LogReader(path).topics == {"/front": "scan"}
+        assert Recording(path).topics == {"/front": "scan"}
 
     def test_a_named_topic_of_another_type(self, tmp_path: Path) -> None:
         text = ("std_msgs/msg/String", "ros2msg", "cdr", b"string data\n")
         path = write_raw(tmp_path / "a.mcap", {"/scan": text}, [])
         with pytest.raises(LogError, match=r"topic /scan: schema 'std_msgs/msg/String' holds no scan; supported: sens"):
-            LogReader(path)
+            Recording(path)
 
     def test_an_unknown_encoding(self, tmp_path: Path) -> None:
         path = write_raw(tmp_path / "a.mcap", {"/scan": ("x.LaserScan", "flatbuffer", "flatbuffer", b"")}, [])
         with pytest.raises(LogError, match=r"'x\.LaserScan' in encoding 'flatbuffer' is not supported"):
-            LogReader(path)
+            Recording(path)
 
     def test_an_unreadable_definition(self, tmp_path: Path) -> None:
         channel = ("sensor_msgs/msg/LaserScan", "ros2msg", "cdr", b"float32[ ranges\x00 ???")
         with pytest.raises(LogError, match="unreadable definition of 'sensor_msgs/msg/LaserScan'"):
-            LogReader(write_raw(tmp_path / "a.mcap", {"/scan": channel}, []))
+            Recording(write_raw(tmp_path / "a.mcap", {"/scan": channel}, []))
         channel = ("sensor_msgs/msg/LaserScan", "ros2msg", "cdr", b"absent_msgs/Thing thing\n")
         with pytest.raises(LogError, match="unreadable definition"):
-            LogReader(write_raw(tmp_path / "a.mcap", {"/scan": channel}, []))
+            Recording(write_raw(tmp_path / "a.mcap", {"/scan": channel}, []))
 
     def test_a_topic_without_a_schema(self, tmp_path: Path) -> None:
         with pytest.raises(LogError, match="topic /scan: "):
-            LogReader(write_raw(tmp_path / "a.mcap", {"/scan": ("", "", "cdr", b"")}, []))
+            Recording(write_raw(tmp_path / "a.mcap", {"/scan": ("", "", "cdr", b"")}, []))
 
     def test_no_definition_but_a_known_type(self, tmp_path: Path) -> None:
         schema, data = ros_types.encode(scan(T0))
         path = write_raw(tmp_path / "a.mcap", {"/scan": (schema, "ros2msg", "cdr", b"")}, [("/scan", T0, data)])
-        assert_same(list(LogReader(path)), [scan(T0)])
+        assert_same(list(Recording(path)), [scan(T0)])
 
     def test_ground_truth_is_never_taken_for_odometry(self, tmp_path: Path) -> None:
         schema, data = ros_types.encode(OdometryMessage(T0, 1.0, 2.0, 0.0))
         channels = {"/scan": SCAN_CHANNEL, "/ground_truth/odom": ros_channel(schema)}
         path = write_raw(tmp_path / "a.mcap", channels, [("/ground_truth/odom", T0, data)])
-        assert list(LogReader(path)) == []
+        assert list(Recording(path)) == []
 
 
 class TestContent:
     def test_impossible_ranges_are_counted(self, tmp_path: Path) -> None:
         distances = [math.nan, -1.0, 0.0, math.inf, 201.0, 199.0]
         messages: list[Message] = [scan(T0), *(RangeMessage(T0, 0, 1, d) for d in distances)]
-        reader = LogReader(write_log(tmp_path / "a.mcap", [*messages, RangeMessage(T0, 3, 3, 1.0)]))
+        reader = Recording(write_log(tmp_path / "a.mcap", [*messages, RangeMessage(T0, 3, 3, 1.0)]))
         assert [m.range for m in reader if isinstance(m, RangeMessage)] == [199.0]
         assert reader.dropped == {
             "range: not finite or not positive": 4,
             "range: over 200 m": 1,
             "range: from a node to itself": 1,
         }
-        far = LogReader(tmp_path / "a.mcap", uwb=UwbSettings(max_range=300.0))
+        far = Recording(tmp_path / "a.mcap", uwb=UwbSettings(max_range=300.0))
         assert [m.range for m in far if isinstance(m, RangeMessage)] == [201.0, 199.0]
 
     @settings(max_examples=30)
@@ -546,7 +546,7 @@ class TestContent:
             {topic: ros_channel(schema) for topic, (schema, _) in zip(topics, encoded, strict=True)},
             [(topic, T0, content) for topic, content in zip(topics, broken, strict=True)],
         )
-        reader = LogReader(path)
+        reader = Recording(path)
         assert list(reader) == []
         assert reader.dropped == {"scan: malformed": 1, "range: malformed": 1, "odometry: malformed": 1}
 
@@ -558,7 +558,7 @@ class TestContent:
             dataclasses.replace(base, angle_min=math.nan),
             dataclasses.replace(base, range_min=0.0, range_max=0.0),
         ]
-        reader = LogReader(write_log(tmp_path / "a.mcap", messages))
+        reader = Recording(write_log(tmp_path / "a.mcap", messages))
         (only,) = reader
         assert isinstance(only, ScanMessage)
         assert (only.range_min, only.range_max) == (0.0, math.inf)
@@ -570,7 +570,7 @@ class TestContent:
         with LogWriter(tmp_path / "a.mcap") as writer:
             for message in messages:
                 writer.write(message, log_time=T0)
-        assert [m.stamp for m in LogReader(tmp_path / "a.mcap")] == [T0, T0]
+        assert [m.stamp for m in Recording(tmp_path / "a.mcap")] == [T0, T0]
 
     def test_another_order_of_fields_is_read_from_the_definition(self, tmp_path: Path) -> None:
         text = "float64 range\nuint16 target\nuint16 source\nstd_msgs/Header header\n"
@@ -584,7 +584,7 @@ class TestContent:
             path = write_raw(
                 tmp_path / "a.mcap", {"/scan": SCAN_CHANNEL, "/uwb/ranges": channel}, [("/uwb/ranges", T0, data)]
             )
-            assert_same(list(LogReader(path)), [RangeMessage(T0, 3, 7, 2.5)])
+            assert_same(list(Recording(path)), [RangeMessage(T0, 3, 7, 2.5)])
 
     def test_big_endian(self, tmp_path: Path) -> None:
         built = ros_types.build(
@@ -595,7 +595,7 @@ class TestContent:
         data = bytes(ros_types.STORE.serialize_cdr(built, ros_types.UWB_RANGE, little_endian=False))
         channels = {"/scan": SCAN_CHANNEL, "/uwb/ranges": ros_channel(ros_types.UWB_RANGE)}
         path = write_raw(tmp_path / "a.mcap", channels, [("/uwb/ranges", T0, data)])
-        assert_same(list(LogReader(path)), [RangeMessage(T0, 3, 4, 2.5, -80.0, -82.0)])
+        assert_same(list(Recording(path)), [RangeMessage(T0, 3, 4, 2.5, -80.0, -82.0)])
 
     def test_idl_definitions(self, tmp_path: Path) -> None:
         _, data = ros_types.encode(RangeMessage(T0, 3, 4, 2.5, -80.0, -82.0))
@@ -615,7 +615,7 @@ class TestContent:
         path = write_raw(
             tmp_path / "a.mcap", {"/scan": SCAN_CHANNEL, "/uwb/ranges": channel}, [("/uwb/ranges", T0, data)]
         )
-        assert_same(list(LogReader(path)), [RangeMessage(T0, 3, 4, 2.5, -80.0, -82.0)])
+        assert_same(list(Recording(path)), [RangeMessage(T0, 3, 4, 2.5, -80.0, -82.0)])
 
 
 NODE2 = "uint8 role\nuint8 id\nfloat32 dis\nfloat32 fp_rssi\nfloat32 rx_rssi\n"
@@ -651,7 +651,7 @@ class TestForeignTypes:
             {"/scan": SCAN_CHANNEL, "/nlink": (name, "ros2msg", "cdr", definition.encode())},
             [("/nlink", T0, bytes(store.serialize_cdr(message, name)))],
         )
-        reader = LogReader(path)
+        reader = Recording(path)
         stamp = T0 + 5 if with_header else T0
         assert_same(list(reader), [RangeMessage(stamp, 5, 1, 2.5, -80.0, -82.0)])
         assert reader.dropped == {"range: not finite or not positive": 1, "range: from a node to itself": 1}
@@ -664,7 +664,7 @@ class TestForeignTypes:
         data = bytes(store.serialize_cdr(store.types[name](2, 0, 1, 2, 4.0, nodes), name))
         channel = (name, "ros2msg", "cdr", store.generate_msgdef(name, ros_version=2)[0].encode())
         path = write_raw(tmp_path / "a.mcap", {"/scan": SCAN_CHANNEL, "/nlink": channel}, [("/nlink", T0, data)])
-        assert [m.target for m in LogReader(path) if isinstance(m, RangeMessage)] == [256, 1]
+        assert [m.target for m in Recording(path) if isinstance(m, RangeMessage)] == [256, 1]
 
     @pytest.mark.parametrize("encoding", ["cdr", "ros1"])
     def test_range_stamped(self, tmp_path: Path, encoding: str) -> None:
@@ -682,11 +682,11 @@ class TestForeignTypes:
             data = bytes(store.serialize_ros1(message, name))
             channel = ("uwb_ros/RangeStamped", "ros1msg", "ros1", store.generate_msgdef(name)[0].encode())
         path = write_raw(tmp_path / "a.mcap", {"/scan": SCAN_CHANNEL, "/uwb": channel}, [("/uwb", T0 + 9, data)])
-        assert_same(list(LogReader(path)), [RangeMessage(T0, 10, 3, 2.5)])
+        assert_same(list(Recording(path)), [RangeMessage(T0, 10, 3, 2.5)])
 
     def test_a_range_stamped_without_ids_is_no_candidate(self, tmp_path: Path) -> None:
         channel = ("mil_msgs/msg/RangeStamped", "ros2msg", "cdr", b"float64 range\n")
-        reader = LogReader(write_raw(tmp_path / "a.mcap", {"/scan": SCAN_CHANNEL, "/dvl": channel}, []))
+        reader = Recording(write_raw(tmp_path / "a.mcap", {"/scan": SCAN_CHANNEL, "/dvl": channel}, []))
         assert reader.warnings == ["no UWB topic: LiDAR only"]
 
     def test_foxglove_json(self, tmp_path: Path) -> None:
@@ -695,7 +695,7 @@ class TestForeignTypes:
         data = json.dumps(content | {"ranges": [1.0, None, 3.0], "intensities": []}).encode()
         channel = ("foxglove.LaserScan", "jsonschema", "json", b"{}")
         bad = [("/lidar", T0, data), ("/lidar", T0, b"{"), ("/lidar", T0, b"{}"), ("/lidar", T0, b"[1]")]
-        reader = LogReader(write_raw(tmp_path / "a.mcap", {"/lidar": channel}, bad))
+        reader = Recording(write_raw(tmp_path / "a.mcap", {"/lidar": channel}, bad))
         wanted = ScanMessage(T0, -1.0, 1.0, 0.0, 0.0, math.inf, np.array([1.0, np.nan, 3.0], np.float32))
         assert_same(list(reader), [wanted])
         assert reader.dropped == {"scan: malformed": 3}
@@ -717,7 +717,7 @@ class TestForeignTypes:
         unpacked = head + b"".join(b"\x31" + struct.pack("<d", r) for r in (1.0, math.inf, 3.0))
         channel = ("foxglove.LaserScan", "protobuf", "protobuf", b"")
         messages = [("/lidar", T0, data) for data in (packed, unpacked, packed[:-3], b"\x0b", packed[:60])]
-        reader = LogReader(write_raw(tmp_path / "a.mcap", {"/lidar": channel}, messages))
+        reader = Recording(write_raw(tmp_path / "a.mcap", {"/lidar": channel}, messages))
         wanted: Message = ScanMessage(T0, -1.0, 1.0, 0.0, 0.0, math.inf, np.array([1.0, np.inf, 3.0], np.float32))
         assert_same(list(reader), [wanted, wanted])
         assert reader.dropped.total() == 3
@@ -735,7 +735,7 @@ class TestForeignTypes:
         message = store.types[name](time, "laser", pose, -1.0, 1.0, np.array([1.0, 2.0, 3.0]), np.zeros(0))
         channel = (name, "ros2msg", "cdr", store.generate_msgdef(name, ros_version=2)[0].encode())
         data = bytes(store.serialize_cdr(message, name))
-        reader = LogReader(write_raw(tmp_path / "a.mcap", {"/lidar": channel}, [("/lidar", T0 + 1, data)]))
+        reader = Recording(write_raw(tmp_path / "a.mcap", {"/lidar": channel}, [("/lidar", T0 + 1, data)]))
         wanted = ScanMessage(T0, -1.0, 1.0, 0.0, 0.0, math.inf, np.array([1.0, 2.0, 3.0], np.float32))
         assert_same(list(reader), [wanted])
 
@@ -774,7 +774,7 @@ class TestInspect:
 
 def test_intel(shared_data: Path) -> None:
     """Counts as the folder's README says; the first and last messages."""
-    reader = LogReader(shared_data / "intel" / "intel.mcap")
+    reader = Recording(shared_data / "intel" / "intel.mcap")
     assert reader.message_count == 130_355
     first = list(itertools.islice(reader, 200))
     scans = [m for m in first if isinstance(m, ScanMessage)]

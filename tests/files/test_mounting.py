@@ -11,7 +11,7 @@ import pytest
 from transform_log import SCAN, T0, measured, transform, write
 
 from uwbslam_jax import api
-from uwbslam_jax.files import LogReader, mounting
+from uwbslam_jax.files import Recording, mounting
 from uwbslam_jax.measurements import OdometryMessage
 from uwbslam_jax.session.frame_assembler import pad_scan
 from uwbslam_jax.settings import RobotSettings, Settings
@@ -35,7 +35,7 @@ def test_the_scanners_frame_tells_where_it_sits(
     tmp_path: Path, slash: str, turn: tuple[float, float, float], pose: tuple[float, float, float], flip: bool
 ) -> None:
     still = transform(T0, f"{slash}base_link", f"{slash}laser", (0.1, 0.02, 0.3), turn)
-    reader = LogReader(write(tmp_path / "a.mcap", [("/tf_static", T0, still), *measured()]))
+    reader = Recording(write(tmp_path / "a.mcap", [("/tf_static", T0, still), *measured()]))
     lidar = reader.mounting.lidar
     assert lidar is not None
     assert (lidar.frame, lidar.base, lidar.flip) == ("laser", "base_link", flip)
@@ -55,7 +55,7 @@ def test_a_chain_across_files_late_and_with_a_radio(tmp_path: Path) -> None:
         ("/tf_static", T0 + 10**10, transform(T0, "base_footprint", "mount", (0.2, 0, 0.5), (0, 0, PI / 2))),
         ("/tf_static", T0 + 10**10, transform(T0, "mount", "uwb", (0.0, 0.1, 0.4))),
     ]
-    found = LogReader([first, write(tmp_path / "b.mcap", late)]).mounting
+    found = Recording([first, write(tmp_path / "b.mcap", late)]).mounting
     assert found.lidar is not None
     assert found.lidar.base == "base_footprint"
     assert found.lidar.pose == pytest.approx((0.2, 0.1, PI / 2), abs=1e-5)
@@ -65,16 +65,16 @@ def test_a_chain_across_files_late_and_with_a_radio(tmp_path: Path) -> None:
 def test_transforms_at_rest_on_tf_count_and_those_that_turn_do_not(tmp_path: Path) -> None:
     still = [("/tf", T0 + k, transform(T0 + k, "base_link", "laser", (0.1, 0, 0))) for k in range(5)]
     turning = [("/tf", T0 + k, transform(T0 + k, "base_link", "laser", (0.1, 0, 0), (0, 0, 0.1 * k))) for k in range(5)]
-    found = LogReader(write(tmp_path / "a.mcap", [*measured(), *still])).mounting.lidar
+    found = Recording(write(tmp_path / "a.mcap", [*measured(), *still])).mounting.lidar
     assert found is not None
     assert found.pose == (0.1, 0.0, 0.0)
-    assert LogReader(write(tmp_path / "b.mcap", [*measured(), *turning])).mounting.lidar is None
+    assert Recording(write(tmp_path / "b.mcap", [*measured(), *turning])).mounting.lidar is None
 
 
 @pytest.mark.parametrize("links", [[], [("map", "laser")], [("laser", "laser")], [("a", "laser"), ("laser", "a")]])
 def test_no_way_to_the_robot_tells_nothing(tmp_path: Path, links: list[tuple[str, str]]) -> None:
     still = [("/tf_static", T0, transform(T0, *link)) for link in links]
-    reader = LogReader(write(tmp_path / "a.mcap", [*still, *measured()]))
+    reader = Recording(write(tmp_path / "a.mcap", [*still, *measured()]))
     assert reader.mounting == mounting.Mounting()
     assert mounting.mounted(Settings(), reader.mounting) == Settings()
 
@@ -83,11 +83,11 @@ def test_what_is_configured_holds_and_is_told_where_it_differs(tmp_path: Path) -
     still = transform(T0, "base_link", "laser", (0.1, 0.0, 0.3), (PI, 0.0, 0.0))
     path = write(tmp_path / "a.mcap", [("/tf_static", T0, still), *measured()])
     wanted = Settings(robot=RobotSettings(lidar=(0.1, 0.0, PI)))
-    told = mounting.contradictions(mounting.mounted(wanted, LogReader(path).mounting), LogReader(path).mounting)
+    told = mounting.contradictions(mounting.mounted(wanted, Recording(path).mounting), Recording(path).mounting)
     assert len(told) == 1
     assert "upside down" in told[0]
     assert "--robot.lidar 0.1 0 0 --robot.lidar-flip" in told[0]
-    assert mounting.mounted(wanted, LogReader(path).mounting) == wanted
+    assert mounting.mounted(wanted, Recording(path).mounting) == wanted
     assert told == [p for p in api.inspect(path, wanted).problems if p in told]
     assert not api.inspect(path).problems
     assert "mounting: laser sits on base_link at 0.1 0 0 (x, y [m], yaw [rad]), upside down" in str(api.inspect(path))
@@ -125,15 +125,15 @@ def test_odometry_is_read_from_transforms_where_it_has_no_topic(tmp_path: Path) 
             ("/tf", stamp + 6, transform(stamp, "/odom", "/base_footprint", (0.1 * k, 0, 0), (0, 0, 0.05 * k))),
             ("/tf", stamp + 7, transform(stamp, "map", "odom", (0, 0.01 * k, 0))),
         ]
-    reader = LogReader(write(tmp_path / "a.mcap", [*measured(), *moving]))
+    reader = Recording(write(tmp_path / "a.mcap", [*measured(), *moving]))
     assert reader.topics["/tf"] == "odom"
     found = [m for m in reader if isinstance(m, OdometryMessage)]
     assert [m.stamp for m in found] == [T0 + k * 10**8 for k in range(10)]
     np.testing.assert_allclose(
         [(m.x, m.y, m.yaw) for m in found], [(0.1 * k, 0, 0.05 * k) for k in range(10)], atol=1e-12
     )
-    assert "/tf" not in LogReader(tmp_path / "a.mcap", odom_topic=None).topics
-    without = LogReader(write(tmp_path / "b.mcap", [*measured(), *moving[::3]]))
+    assert "/tf" not in Recording(tmp_path / "a.mcap", odom_topic=None).topics
+    without = Recording(write(tmp_path / "b.mcap", [*measured(), *moving[::3]]))
     assert "odom" not in without.topics.values()
 
 
@@ -141,7 +141,7 @@ def test_odometry_without_an_orientation_is_left_out_and_told(tmp_path: Path) ->
     moving = [("/tf", T0 + k, transform(T0 + k, "odom", "base_link", (0.1 * k, 0, 0))) for k in range(6)]
     q = moving[3][2].transforms[0].transform.rotation
     q.x = q.y = q.z = q.w = 0.0
-    reader = LogReader(write(tmp_path / "a.mcap", [*measured(), *moving]))
+    reader = Recording(write(tmp_path / "a.mcap", [*measured(), *moving]))
     assert sum(isinstance(m, OdometryMessage) for m in reader) == 5
     assert reader.dropped == {"odometry: orientation is no rotation": 1}
     assert "--no-odom" in reader.warnings[-1]

@@ -13,7 +13,7 @@ from mcap.writer import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from uwbslam_jax.errors import LogError
-from uwbslam_jax.files import LogReader, settings_file
+from uwbslam_jax.files import Recording, settings_file
 from uwbslam_jax.files.range_layouts import fields_of_type, find_layout
 from uwbslam_jax.files.range_messages import Options, topic_name
 from uwbslam_jax.measurements import RangeMessage
@@ -76,7 +76,7 @@ def record(path: Path, name: str, text: str, messages: Sequence[tuple[str, Field
 
 
 def read(path: Path, robot_id: int = 0, **uwb: Any) -> list[tuple[int, int, int, float]]:
-    reader = LogReader(path, robot_id=robot_id, uwb=UwbSettings(**uwb))
+    reader = Recording(path, robot_id=robot_id, uwb=UwbSettings(**uwb))
     found = [m for m in reader if isinstance(m, RangeMessage)]
     return [(m.stamp, m.source, m.target, round(m.range, 4)) for m in found]
 
@@ -220,7 +220,7 @@ def test_powers_and_json(tmp_path: Path) -> None:
     name, text, fields, _ = CASES["Nodeframe5"]
     fields["nodes"][0] |= {"fp_rssi": -82.0, "rx_rssi": -80.0}
     path = record(tmp_path / "a.mcap", name, text, [("/a", fields)])
-    (found,) = LogReader(path)
+    (found,) = Recording(path)
     assert isinstance(found, RangeMessage)
     assert (found.receive_power, found.first_path_power) == (-80.0, -82.0)
     with (tmp_path / "b.mcap").open("wb") as file:
@@ -230,7 +230,7 @@ def test_powers_and_json(tmp_path: Path) -> None:
         for k, content in enumerate(['{"tag": "t1", "beacon": "b7", "range": 3}', "[1]", "{", '{"tag": 1}']):
             writer.add_message(channel, LOG + k, content.encode(), LOG + k)
         writer.finish()
-    reader = LogReader(tmp_path / "b.mcap")
+    reader = Recording(tmp_path / "b.mcap")
     assert list(reader) == [RangeMessage(LOG, 1, 7, 3.0, math.nan, math.nan)] or reader.dropped.total() == 3
 
 
@@ -248,9 +248,9 @@ def test_a_topic_for_each_node(tmp_path: Path, ros1: bool) -> None:
     path = record(tmp_path / "a.mcap", RANGE, RANGE_TEXT, ranges_on(topics), ros1=ros1)
     # one is called as the robot's own node is: it gets another number
     assert [(m[1], m[2]) for m in read(path)] == [(0, 256), (0, 5), (0, 12)]
-    one = LogReader(path, uwb_topic="/robot1/uwb/anchor_5/*")
+    one = Recording(path, uwb_topic="/robot1/uwb/anchor_5/*")
     assert [m.target for m in one if isinstance(m, RangeMessage)] == [5]
-    assert set(LogReader(path).topics.values()) == {"uwb"}
+    assert set(Recording(path).topics.values()) == {"uwb"}
 
 
 def test_one_topic_whose_frame_names_the_node(tmp_path: Path) -> None:
@@ -260,16 +260,16 @@ def test_one_topic_whose_frame_names_the_node(tmp_path: Path) -> None:
 
 def test_sonars_are_no_radio_unless_named(tmp_path: Path) -> None:
     path = record(tmp_path / "a.mcap", RANGE, RANGE_TEXT, ranges_on(["/sonar_1", "/sonar_2"]))
-    reader = LogReader(path, uwb_topic="/sonar_*")
+    reader = Recording(path, uwb_topic="/sonar_*")
     assert [m.target for m in reader if isinstance(m, RangeMessage)] == [1, 2]
     with pytest.raises(LogError, match="no scan topic"):
-        LogReader(path)
-    assert "/sonar_1, /sonar_2 are not taken for a radio's" in LogReader(path, scan_topic=None).warnings[-1]
+        Recording(path)
+    assert "/sonar_1, /sonar_2 are not taken for a radio's" in Recording(path, scan_topic=None).warnings[-1]
 
 
 def test_what_is_not_read_is_told_with_its_fields(tmp_path: Path) -> None:
     path = record(tmp_path / "a.mcap", "odd/msg/UwbThing", "float32 metres\nuint8 who\n", [("/odd", {"metres": 2.5})])
-    (told,) = [w for w in LogReader(path, scan_topic=None).warnings if "[uwb.message]" in w]
+    (told,) = [w for w in Recording(path, scan_topic=None).warnings if "[uwb.message]" in w]
     assert "/odd" in told
     assert "odd/msg/UwbThing" in told
     assert "metres, who" in told
@@ -307,7 +307,7 @@ def test_a_message_that_the_user_describes(tmp_path: Path) -> None:
     assert settings_file.load_settings(toml) == settings
     fields = {"seconds": 5.5, "who": {"near": "T1", "far": "A2"}, "millimetres": 2500, "dbm": -80.0}
     path = record(tmp_path / "a.mcap", "odd_msgs/msg/UwbThing", FLAT, [("/odd", fields)])
-    (found,) = LogReader(path, uwb=settings.uwb)
+    (found,) = Recording(path, uwb=settings.uwb)
     wanted = RangeMessage(5_500_000_000, 1, 2, 2.5, -80.0)
     assert str(found) == str(wanted)
     toml.write_text(TOML_LISTS)
@@ -322,10 +322,10 @@ def test_a_description_that_does_not_fit_says_what_there_is(tmp_path: Path) -> N
     toml.write_text(TOML_LISTS.replace("links[].r", "links[].range"))
     path = record(tmp_path / "b.mcap", "odd_msgs/msg/Swarm", LISTS, [("/odd", {"me": 1})])
     uwb = settings_file.load_settings(toml).uwb
-    reader = LogReader(path, uwb=uwb, scan_topic=None)
+    reader = Recording(path, uwb=uwb, scan_topic=None)
     assert any("has no links[].range; it has me, links[].peer" in told for told in reader.warnings)
     with pytest.raises(LogError, match=r"has no links\[\]\.range"):
-        LogReader(path, uwb=uwb, uwb_topic="/odd")
+        Recording(path, uwb=uwb, uwb_topic="/odd")
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from uwbslam_jax.files import LogReader, LogWriter, inspect_log
-from uwbslam_jax.files.mcap_container import Recording
+from uwbslam_jax.files import LogWriter, Recording, inspect_log
+from uwbslam_jax.files.mcap_container import McapFile
 from uwbslam_jax.measurements import Message, RangeMessage, ScanMessage
 
 T0 = 1_700_000_000_000_000_000
@@ -40,7 +40,7 @@ def test_what_was_recorded_after_the_clock_was_set_back_comes_after(tmp_path: Pa
         for m in kept
     ]
     path = write(tmp_path / "back.mcap", rows)
-    reader = LogReader(path)
+    reader = Recording(path)
     found = list(reader)
     assert len(found) == len(kept)
     assert all(type(a) is type(b) and abs(a.stamp - b.stamp) < S // 10 for a, b in zip(found, kept, strict=True))
@@ -56,7 +56,7 @@ def test_messages_out_of_order_are_put_in_order(tmp_path: Path) -> None:
     mixed = [(kept[k], kept[k].stamp) for k in np.random.default_rng(0).permutation(len(kept))]
     by_topic = [(m, m.stamp) for kind in (ScanMessage, RangeMessage) for m in kept if isinstance(m, kind)]
     for rows in (mixed, by_topic):
-        found = list(Recording(write(tmp_path / "mixed.mcap", rows)).records())
+        found = list(McapFile(write(tmp_path / "mixed.mcap", rows)).records())
         assert [raw.log_time for raw in found] == [m.stamp for m in kept]
 
 

@@ -15,7 +15,7 @@ from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from uwbslam_jax.errors import LogError
-from uwbslam_jax.files import LogReader, LogWriter, ros_types
+from uwbslam_jax.files import LogWriter, Recording, ros_types
 from uwbslam_jax.measurements import Message, RangeMessage, ScanMessage
 
 MS = 1_000_000
@@ -134,7 +134,7 @@ def test_every_container_gives_the_same_messages(tmp_path: Path, name: str) -> N
     wanted = [key(message) for message in drive()]
     path = KINDS[name](tmp_path / name, drive())
     for source in (path, tmp_path):  # alone, and in a folder without metadata
-        reader = LogReader(source)
+        reader = Recording(source)
         for _ in range(2):
             assert [key(message) for message in reader] == wanted
         assert (reader.message_count, reader.truncated, reader.dropped.total()) == (len(wanted), None, 0)
@@ -161,23 +161,23 @@ def test_bags_in_folders(tmp_path: Path, name: str) -> None:
     for listed in metadata_kinds:
         if listed is not None:
             metadata(folder, listed)
-        assert [key(message) for message in LogReader(folder)] == wanted
+        assert [key(message) for message in Recording(folder)] == wanted
     (folder / "metadata.yaml").unlink()
     (folder / names[3]).unlink()
     with pytest.raises(LogError, match="name those that are"):
-        LogReader(folder)
+        Recording(folder)
 
 
 def test_one_that_was_unpacked_beside_its_compressed_file_is_read_once(tmp_path: Path) -> None:
     write_zstd(tmp_path / "a_0.mcap.zstd", drive())
     write_mcap(tmp_path / "a_0.mcap", drive())
-    assert len(list(LogReader(tmp_path))) == len(drive())
+    assert len(list(Recording(tmp_path))) == len(drive())
 
 
 def test_parts_of_a_ros_1_bag_are_named_after_their_time(tmp_path: Path) -> None:
     for k, part in enumerate((drive()[:20], drive()[20:])):
         write_ros1(tmp_path / f"lab_2024-05-01-10-0{k}-00_{k}.bag", part)
-    assert [key(message) for message in LogReader(tmp_path)] == [key(message) for message in drive()]
+    assert [key(message) for message in Recording(tmp_path)] == [key(message) for message in drive()]
 
 
 @pytest.mark.parametrize("name", [name for name in KINDS if name != "a_0.mcap"])
@@ -193,7 +193,7 @@ def test_damaged_ones_give_what_is_there_or_one_line(tmp_path: Path, name: str) 
         path.write_bytes(data)
         told = str(path)
         try:
-            assert len(list(LogReader(path))) <= len(drive())
+            assert len(list(Recording(path))) <= len(drive())
         except LogError as error:
             told = str(error)
         assert str(path) in told
@@ -206,7 +206,7 @@ def test_a_message_that_does_not_unpack_is_counted(tmp_path: Path) -> None:
     data = path.read_bytes()
     assert packed in data
     path.write_bytes(data.replace(packed, packed[:4] + b"\xff" * (len(packed) - 4)))
-    reader = LogReader(path)
+    reader = Recording(path)
     assert len(list(reader)) + reader.dropped.total() == len(drive()) or reader.truncated
 
 
@@ -216,4 +216,4 @@ def test_a_compressed_file_that_grows_beyond_reason_is_not_unpacked(
     monkeypatch.setattr("uwbslam_jax.files.storage._PLENTY_BYTES", 1 << 20)
     (tmp_path / "a.mcap.zstd").write_bytes(zstandard.ZstdCompressor().compress(bytes(1 << 24)))
     with pytest.raises(LogError, match=r"a\.mcap\.zstd: unpacks to over"):
-        LogReader(tmp_path / "a.mcap.zstd")
+        Recording(tmp_path / "a.mcap.zstd")

@@ -26,7 +26,7 @@ from uwbslam_drivers.emulators.plugs import PtyPlug
 from uwbslam_drivers.emulators.robot import Departure, DeviceTime
 from uwbslam_drivers.emulators.serve import EMULATORS, Server
 from uwbslam_jax.__main__ import main
-from uwbslam_jax.files.mcap_log import LogReader
+from uwbslam_jax.files.mcap_log import Recording
 from uwbslam_jax.files.run_folder import read_run, read_trajectory
 from uwbslam_jax.measurements import ScanMessage
 from uwbslam_jax.sim import make_scenario
@@ -124,7 +124,7 @@ def test_a_run_ends_with_all_files_and_says_how_late_it_was(lived: Lived) -> Non
     assert 0.0 < summary["latency_ms_median"] <= summary["latency_ms_p99"]
     # every scan is in the track or counted as dropped; a frame may have no scan
     stamps, _ = read_trajectory(lived.folder / "trajectory.tum")
-    scans = {m.stamp for m in LogReader(lived.recording, uwb_topic=None) if isinstance(m, ScanMessage)}
+    scans = {m.stamp for m in Recording(lived.recording, uwb_topic=None) if isinstance(m, ScanMessage)}
     lost = sum(count for reason, count in summary["dropped"].items() if reason.startswith("scan: "))
     assert summary["devices"]["lidar"]["measurements"] == len(scans & set(stamps.tolist())) + lost, summary["dropped"]
     assert summary["recording"] == lived.recording.name
@@ -144,7 +144,7 @@ def test_the_recording_gives_the_same_track_bit_for_bit(lived: Lived, tmp_path: 
 @pytest.mark.slow
 def test_dropped_scans_are_in_the_recording_apart(lived: Lived) -> None:
     lost = json.loads((lived.folder / "summary.json").read_text())["dropped"].get("scan: overtaken by a newer one", 0)
-    apart = LogReader(lived.recording, scan_topic="/scan_dropped", uwb_topic=None)
+    apart = Recording(lived.recording, scan_topic="/scan_dropped", uwb_topic=None)
     count = sum(isinstance(m, ScanMessage) for m in apart) if "/scan_dropped" in apart.topics else 0
     assert count == lost
 
@@ -216,7 +216,7 @@ def test_a_killed_run_has_its_recording_and_another_goes_on(lived: Lived, tmp_pa
         time.sleep(4.0)
         killed = time.time_ns()
         os.kill(process.pid, signal.SIGKILL)
-    reader = LogReader(next(tmp_path.glob("live-*.mcap")))
+    reader = Recording(next(tmp_path.glob("live-*.mcap")))
     last = max(message.stamp for message in reader)
     assert reader.truncated
     assert killed - last < SECOND

@@ -28,7 +28,7 @@ from uwbslam_jax import estimator
 from uwbslam_jax.api import Slam
 from uwbslam_jax.errors import RunError, UsageError
 from uwbslam_jax.files import ros_types
-from uwbslam_jax.files.mcap_log import LogReader, LogWriter
+from uwbslam_jax.files.mcap_log import LogWriter, Recording
 from uwbslam_jax.live.devices import Devices
 from uwbslam_jax.live.live_run import LiveRun
 from uwbslam_jax.live.message_queue import BEHIND_S, MOST, OVERFULL, OVERTAKEN, Arrival, Inbox
@@ -170,7 +170,7 @@ def test_a_killed_process_loses_at_most_a_second(seconds: float, tmp_path: Path)
         time.sleep(seconds)
         os.kill(process.pid, signal.SIGKILL)
         last = [int(line) for line in process.stdout.read().split()][-1]
-    reader = LogReader(path)
+    reader = Recording(path)
     found = list(reader)
     assert reader.truncated is not None
     assert reader.truncated.startswith("recording breaks")
@@ -188,7 +188,7 @@ def test_what_was_recorded_has_the_numbers_of_what_was_used(tmp_path: Path) -> N
     with LogWriter(tmp_path / "a.mcap") as writer:
         for message in used:
             writer.write(message)
-    back = list(LogReader(tmp_path / "a.mcap"))
+    back = list(Recording(tmp_path / "a.mcap"))
     assert back[0] == used[0]
     assert isinstance(back[1], ScanMessage)
     assert isinstance(used[1], ScanMessage)

@@ -113,7 +113,7 @@ def inspect_log(
     robot_id: int = 0,
     uwb: UwbSettings | None = None,
 ) -> LogSummary:
-    """Reads a recording through and says what it holds; arguments as for `LogReader`.
+    """Reads a recording through and says what it holds; arguments as for `Recording`.
 
     Raises:
       LogError: the file cannot be read at all. Missing or ambiguous topics are `problems` of the summary.

@@ -97,7 +97,7 @@ class _Part(NamedTuple):
     end: int | None = None
 
 
-class Recording:
+class McapFile:
     """An MCAP file opened for reading.
 
     Attributes:

@@ -46,7 +46,7 @@ _FIRST_TRANSFORMS = 500
 """Transforms from odom to the robot are among so many messages, if there are any [messages]."""
 
 
-class LogReader:
+class Recording:
     """Iterates over the measurements of a recording by log time, streaming; may be iterated again.
 
     Attributes:

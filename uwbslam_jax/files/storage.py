@@ -1,6 +1,6 @@
 """What else recordings are kept in: ROS 1 bags, ROS 2 bags in SQLite, and any of them compressed as a whole.
 
-Every kind has the face of `mcap_container.Recording`. ROS 1 bags are read by rosbags; of SQLite's few tables we read
+Every kind has the face of `mcap_container.McapFile`. ROS 1 bags are read by rosbags; of SQLite's few tables we read
 what is there, so that a database without its metadata.yaml, or of any age, is a recording too.
 """
 
@@ -21,7 +21,7 @@ import zstandard
 from rosbags.rosbag1 import Reader, ReaderError
 
 from uwbslam_jax.errors import LogError
-from uwbslam_jax.files.mcap_container import MAGIC, Channel, RawMessage, Recording
+from uwbslam_jax.files.mcap_container import MAGIC, Channel, McapFile, RawMessage
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 """What zstd data begin with [bytes] (RFC 8878); no CDR message does."""
@@ -58,7 +58,7 @@ _DAMAGED_ROWS = (sqlite3.Error, TypeError, ValueError)
 
 @runtime_checkable
 class Part(Protocol):
-    """One file of a recording, opened for reading; see `mcap_container.Recording`."""
+    """One file of a recording, opened for reading; see `mcap_container.McapFile`."""
 
     path: Path
     channels: dict[int, Channel]
@@ -98,7 +98,7 @@ def open_part(path: Path) -> Part:
         raise LogError(f"{path}: packed with {packed}, which is not read: unpack it first")
     if head and not head.startswith(MAGIC):
         raise LogError(f"{path}: not a recording: neither an MCAP file nor a ROS 1 bag nor a ROS 2 bag in SQLite")
-    return Recording(path)
+    return McapFile(path)
 
 
 def unpack_message(data: bytes) -> bytes:
