@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from uwbslam_jax.errors import LogError
 from uwbslam_jax.files.bag import Bag, Source
 from uwbslam_jax.files.first_ranges import look_ahead
+from uwbslam_jax.files.log_facts import LogFacts
 from uwbslam_jax.files.mcap_log import choose_topics, look_first
 from uwbslam_jax.files.mounting import Mounting, read_mounting
 from uwbslam_jax.files.range_messages import Options, names_told
 from uwbslam_jax.files.schemas import Decoder, Role
-from uwbslam_jax.measurements import Message, RangeMessage, ScanMessage
 from uwbslam_jax.session import MessageClocks
 from uwbslam_jax.settings import UwbSettings
 
@@ -55,7 +55,8 @@ class LogSummary:
       beams: most beams of a scan.
       dropped: messages left out, by reason.
       mounting: where the sensors sit, as far as the recording tells.
-      problems: what keeps the recording from being used, or is worth knowing; one line each.
+      problems: what keeps the recording from being used, or is mended with a warning; one line each.
+      notes: what is worth knowing, one line each.
       truncated: where it breaks, None where it does not.
     """
 
@@ -71,6 +72,7 @@ class LogSummary:
     dropped: Counter[str]
     mounting: Mounting
     problems: list[str]
+    notes: list[str]
     truncated: str | None
 
     def __str__(self) -> str:
@@ -99,6 +101,7 @@ class LogSummary:
         lines += [f"mounting: {self.mounting}"] if str(self.mounting) else []
         lines += [f"dropped: {count} x {reason}" for reason, count in sorted(self.dropped.items())]
         lines += [f"problem: {problem}" for problem in self.problems]
+        lines += [f"note: {note}" for note in self.notes]
         lines += [f"truncated: {self.truncated}"] if self.truncated else []
         return "\n".join(lines)
 
@@ -136,7 +139,7 @@ def inspect_log(
     look_ahead(recording, ranges, options, scans=bool({"scan", "odom"} & set(roles.values())))
     topic_of = {channel.id: channel.topic for channel in recording.channels.values()}
     clocks = {topic: _Clock() for topic in topic_of.values()}
-    heard, on_clock = _Heard(), MessageClocks(options.dropped)
+    heard, on_clock = LogFacts(), MessageClocks(options.dropped)
     for log_time, number, data in recording.records():
         if number not in topic_of:
             continue
@@ -158,6 +161,7 @@ def inspect_log(
         beams=heard.beams,
         dropped=options.dropped,
         problems=[*problems, *options.scans.told.values(), *options.told, *names_told(options)],
+        notes=heard.notes(),
         mounting=read_mounting(recording, roles, options.scans.frame),
         truncated=recording.truncated,
     )
@@ -175,26 +179,6 @@ class _Clock:
         else:
             self.first = log_time
         self.count, self.last = self.count + 1, log_time
-
-
-@dataclass
-class _Heard:
-    """What the messages said, gathered."""
-
-    ids: Counter[int] = field(default_factory=Counter)
-    pairs: Counter[tuple[int, int]] = field(default_factory=Counter)
-    powers: bool = False
-    beams: int = 0
-
-    def take(self, messages: list[Message]) -> None:
-        for message in messages:
-            if isinstance(message, RangeMessage):
-                pair = min(message.source, message.target), max(message.source, message.target)
-                self.pairs[pair] += 1
-                self.ids.update(pair)
-                self.powers = self.powers or not math.isnan(message.receive_power - message.first_path_power)
-            elif isinstance(message, ScanMessage):
-                self.beams = max(self.beams, message.ranges.size)
 
 
 def _topics(
