@@ -269,6 +269,7 @@ class TestGoingOn:
 
 
 class TestSimulation:
+    @pytest.mark.slow
     def test_a_run_needs_nothing_else(self) -> None:
         simulation = us.simulate("lever_arms", 3, 2.0, beams=61)
         result = us.run(simulation)

@@ -141,6 +141,7 @@ def test_online_and_batch_look_back_to_the_same_bits(biased) -> None:
     assert_same_bits(online.state, batch.state)
 
 
+@pytest.mark.slow
 def test_the_paper_and_lidar_only_do_not_look_back() -> None:
     settings = dataclasses.replace(SETTINGS, filter=FilterSettings(preset="paper"), uwb=UwbSettings(max_beacons=3))
     run, _ = driven(settings)

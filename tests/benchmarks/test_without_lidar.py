@@ -110,6 +110,7 @@ class TestWheelsAndRanges:
         names = {"trajectory.tum", "beacons.csv", "map.pgm", "map.yaml", "summary.json", "result.mcap", "report.html"}
         assert {path.name for path in (tmp_path / "out").iterdir()} == names | {"state.npz"}
 
+    @pytest.mark.slow
     def test_a_scale_that_is_not_configured_shows(self) -> None:
         """Wheels know the size of the room and the ranges say otherwise: beacons end too far out."""
         configured = replace(SMALL, uwb=UwbSettings(bias_scale=SCALE))

@@ -190,6 +190,7 @@ class TestRun:
         assert "recording breaks after" in summary["truncated"]
         assert 10 < summary["steps"] < FRAMES
 
+    @pytest.mark.slow
     def test_without_ranges_it_is_lidar_only(self, tmp_path: Path, messages: list[Message]) -> None:
         scans = [m for m in messages if not isinstance(m, RangeMessage)]
         path = write(tmp_path / "scans.mcap", scans[: len(scans) // 4])
@@ -287,7 +288,7 @@ def text_file(name: str, text: str) -> Callable[[Path], str]:
 
 WRONG: dict[str, tuple[list[Any], str]] = {
     "missing": (["run", "none.mcap", "-o", "out"], "none.mcap: no such file"),
-    "not an mcap": (["run", text_file("a.mcap", "hello"), "-o", "out"], "not an MCAP file"),
+    "not an mcap": (["run", text_file("a.mcap", "hello"), "-o", "out"], "neither an MCAP file nor"),
     "no scans": (
         ["run", ranges_only, "-o", "out", "--map.size-m", "12.8", "--online"],  # compiles faster
         "no ranges that fix a geometry on /uwb/ranges",

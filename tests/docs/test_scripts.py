@@ -23,8 +23,8 @@ MADE = {
 }
 """Script -> the files that it writes. The first one only makes arrays for another."""
 
-LONG = {"gradient", "tune", "seeds", "compare"}
-"""These compile derivatives or batches, or run more than once."""
+LONG = set(MADE) - {"make_arrays", "first", "inspect_recording"}
+"""All that run the estimator, but for the first."""
 
 
 def test_every_script_is_listed_and_shown() -> None:

@@ -198,6 +198,7 @@ def test_a_problem_that_cannot_be_solved_does_not_raise():
     assert x.shape == (2,)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("x64")
 def test_gradient_of_an_alignment_agrees_with_finite_differences(room_map):
     """Through all moves of all levels, as many as are made: by prior, start, map and sigma_l."""

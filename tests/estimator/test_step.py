@@ -95,6 +95,7 @@ def test_a_scan_of_another_room_is_not_believed_and_not_drawn(room_map):
     np.testing.assert_array_equal(state.grid.levels[0], room_map.levels[0])
 
 
+@pytest.mark.slow
 def test_lidar_only_ignores_ranges(room_map):
     config = dataclasses.replace(FLAT, lidar_only=True)
     finest = room_map._replace(levels=room_map.levels[:1])
@@ -118,6 +119,7 @@ def test_ranges_to_nodes_that_are_not_active_or_not_in_sight_are_not_used(room_m
     np.testing.assert_array_equal(estimate.weight[6:], 0.0)
 
 
+@pytest.mark.slow
 def test_many_float32_steps_keep_the_covariance_healthy(room_map):
     finest = room_map._replace(levels=room_map.levels[:1])
     frame = jax.tree.map(jnp.asarray, measured())
@@ -229,6 +231,7 @@ def test_gradient_of_a_whole_step_agrees_with_finite_differences(room_map):
             assert (np.abs(leaf).max() > 0) == (not (valid and name == "sigma_w")), name
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("x64")
 def test_gradient_through_a_first_scan_that_is_drawn_is_finite():
     """No map to match, no beam with a gradient: nothing may divide by that."""

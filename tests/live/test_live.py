@@ -111,6 +111,7 @@ def end_after_start_up(process: subprocess.Popen[str], folder: Path, over: threa
 
 
 @pytest.mark.slow
+@pytest.mark.realtime
 def test_a_run_ends_with_all_files_and_says_how_late_it_was(lived: Lived) -> None:
     assert lived.status == 0
     assert {path.name for path in lived.folder.iterdir() if not path.is_symlink()} == FILES | {
@@ -131,6 +132,7 @@ def test_a_run_ends_with_all_files_and_says_how_late_it_was(lived: Lived) -> Non
 
 
 @pytest.mark.slow
+@pytest.mark.realtime
 def test_the_recording_gives_the_same_track_bit_for_bit(lived: Lived, tmp_path: Path) -> None:
     # in a process of its own, as a user runs it: pytest has loaded numpy by now, with LAPACK's threads, which round
     # differently from one run to the next
@@ -142,6 +144,7 @@ def test_the_recording_gives_the_same_track_bit_for_bit(lived: Lived, tmp_path: 
 
 
 @pytest.mark.slow
+@pytest.mark.realtime
 def test_dropped_scans_are_in_the_recording_apart(lived: Lived) -> None:
     lost = json.loads((lived.folder / "summary.json").read_text())["dropped"].get("scan: overtaken by a newer one", 0)
     apart = Recording(lived.recording, scan_topic="/scan_dropped", uwb_topic=None)
@@ -161,6 +164,7 @@ def published(log: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.slow
+@pytest.mark.realtime
 @needs_browser
 def test_the_page_shows_the_pose_that_was_sent(lived: Lived) -> None:
     stamps, poses = published(lived.folder / "result.mcap")
@@ -183,6 +187,7 @@ def test_the_page_shows_the_pose_that_was_sent(lived: Lived) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.realtime
 @needs_browser
 def test_the_page_tells_of_start_up_devices_and_beacons(lived: Lived) -> None:
     assert "Waiting for motion" in lived.words["early"]
@@ -197,6 +202,7 @@ def test_the_page_tells_of_start_up_devices_and_beacons(lived: Lived) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.realtime
 def test_localising_leaves_the_map_as_it_was(lived: Lived, tmp_path: Path) -> None:
     words = ["live", "--emulate", "workshop", "-o", str(tmp_path / "out"), "--duration", "4"]
     assert main([*words, "--localize", str(lived.folder), "--view", "off"]) == 0
@@ -208,6 +214,7 @@ def test_localising_leaves_the_map_as_it_was(lived: Lived, tmp_path: Path) -> No
 
 
 @pytest.mark.slow
+@pytest.mark.realtime
 def test_a_killed_run_has_its_recording_and_another_goes_on(lived: Lived, tmp_path: Path) -> None:
     words = [sys.executable, "-m", "uwbslam_jax", "live", "--emulate", "workshop", "-o", str(tmp_path)]
     words += ["--resume", str(lived.folder), "--view", "off"]
@@ -322,6 +329,7 @@ def test_what_a_user_can_mend_is_one_line(
 
 
 @pytest.mark.slow
+@pytest.mark.realtime
 def test_a_radio_alone_runs_and_says_what_it_cannot_tell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     departure = Departure()
     device = EMULATORS["dwm1001"](DeviceTime(time.time_ns()))
@@ -344,6 +352,8 @@ def test_a_radio_alone_runs_and_says_what_it_cannot_tell(tmp_path: Path, capsys:
     assert all(warning in top for warning in summary["warnings"])
 
 
+@pytest.mark.slow
+@pytest.mark.realtime
 def test_devices_that_are_not_there_are_told_at_the_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     url = f"tcp://127.0.0.1:{free_port()}"
     small = ["--map.size-m", "12.8", "--lidar.max-beams", "60", "--uwb.max-beacons", "3"]  # compiles faster

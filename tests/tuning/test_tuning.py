@@ -36,6 +36,7 @@ def drive(count: int):
     return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *frames)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("x64")
 def test_gradient_through_fifty_steps_agrees_with_central_differences():
     room_map = drawn_map()
