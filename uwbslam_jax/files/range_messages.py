@@ -157,7 +157,7 @@ def _places(lists: list[str], levels: list[Any], index: int) -> Iterator[_Place]
         yield from _places(lists, [*levels, element], k)
 
 
-def range_taker(layout: Layout, topic: str, options: Options) -> Callable[[Any, int, StampOf], list[Message]]:
+def range_taker(layout: Layout, topic: str, options: Options) -> Callable[[Any, StampOf], list[Message]]:
     """A function from a message of a layout, its log time [ns] and what tells the time of a message, to its ranges.
 
     It raises what getattr, int, float and lists raise where a message is not so.

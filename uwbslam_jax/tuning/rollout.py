@@ -185,11 +185,15 @@ def losses(config: Config, params: Params, state: State, frames: Frame) -> Losse
     return lax.scan(partial(_step, config, params), state, frames)[1]
 
 
+def _mean(config: Config, params: Params, before: Params, state: State, frames: Frame) -> Float[Array, ""]:
+    told = losses(config, params, rescaled(params, before, state), frames)
+    return (jnp.sum(told.ranges) + jnp.sum(told.matches)) / (jnp.sum(told.counts) + jnp.sum(frames.has_scan))
+
+
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
 @partial(jax.jit, static_argnums=0)
 def _loss(config: Config, params: Params, before: Params, state: State, frames: Frame) -> Float[Array, ""]:
-    told = losses(config, params, rescaled(params, before, state), frames)
-    return (jnp.sum(told.ranges) + jnp.sum(told.matches)) / (jnp.sum(told.counts) + jnp.sum(frames.has_scan))
+    return _mean(config, params, before, state, frames)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -199,7 +203,7 @@ def _loss_and_gradient(config: Config, params: Params, *rest: Any) -> tuple[Floa
     flat, unravel = ravel_pytree(params)
 
     def loss(flat: Float[Array, "p"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        value = _loss.fun(config, unravel(flat), *rest)
+        value = _mean(config, unravel(flat), *rest)
         return value, value
 
     gradient, value = jax.jacfwd(loss, has_aux=True)(flat)
