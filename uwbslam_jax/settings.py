@@ -165,7 +165,7 @@ class UwbSettings:
     """Ranging."""
 
     topic: str = "/uwb/ranges"
-    """Topic of the ranges; with * in it, several that are one radio's, as "/anchor_*/range"."""
+    """Topic of the ranges; with * in it, several that are one radio's, such as ``/anchor*/range``."""
     unit: Literal["auto", "m", "cm", "mm"] = "auto"
     """Unit of the recorded ranges; auto: what their message says, unless only another one explains them."""
     sigma_n: float = 0.1
