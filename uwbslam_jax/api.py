@@ -155,8 +155,9 @@ def run(
     total = reader.message_count if reader is not None else 0
     with CompileClock() as clock:
         runner = Runner(settings, clock, online=online, saved=saved, fixed=fixed)
+        take = runner.add if reader is None else runner.take
         for count, message in enumerate(messages):
-            runner.add(message)
+            take(message)
             if progress is not None and count % _PROGRESS_EVERY == 0:
                 progress(count, total)
         runner.finish()

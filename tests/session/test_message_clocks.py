@@ -230,3 +230,15 @@ def test_junk_does_no_harm() -> None:
         assert len(known) >= least
         assert T0 - S < known.min() <= known.max() < T0 + 21 * S
     assert len(timed(rows, log=False)) > 0
+
+
+def test_what_is_told_keeps_its_subject_while_its_counts_grow() -> None:
+    """A live run tells each subject once."""
+    clocks, subjects, lines = MessageClocks(), set(), set()
+    for k, (message, log) in enumerate(drive()):
+        bare = isinstance(message, RangeMessage) and k > 200
+        clocks.take(dataclasses.replace(message, stamp=0) if bare else message, log, TOPICS[type(message)])
+        subjects |= set(clocks.told())
+        lines |= set(clocks.warnings)
+    assert subjects == {("/uwb", "bare")}
+    assert len(lines) > 100

@@ -177,7 +177,7 @@ class LiveRun:
         found |= {line: line for line in self._lasting(self._devices.troubles())}
         if self._recorder.failure:
             found["recording"] = f"recording: {self._recorder.failure}"
-        found |= {line: line for line in self._clocks.warnings}
+        found |= self._clocks.told()
         found |= self._slam.runner.warnings(dropped, _MANY_LOST)
         for subject, line in found.items():
             if subject not in self.told:

@@ -157,10 +157,17 @@ class MessageClocks:
     @property
     def warnings(self) -> list[str]:
         """What was wrong with clocks so far, one line each."""
-        told = list(self._apart)
+        return list(self.told().values())
+
+    def told(self) -> dict[object, str]:
+        """The same by subject: a line may change as counts grow, what it is about does not."""
+        told: dict[object, str] = {line: line for line in self._apart}
         if self._paused is not None and self._first is not None:
-            told.append(told_pause(self._paused[0], self._paused[1] - self._first[0]))
-        return [*told, *told_jumps(self._jumps), *(line for own in self._topics.values() for line in own.warnings())]
+            told["pause"] = told_pause(self._paused[0], self._paused[1] - self._first[0])
+        told |= told_jumps(self._jumps)
+        for own in self._topics.values():
+            told |= own.told()
+        return told
 
     def _good(self, own: TopicClock, message: Message, stamp: int, log: int | None) -> Message:
         """A message with its stamp on the common clock; its topic goes on from it."""

@@ -72,16 +72,13 @@ class Runner:
         self.not_located: Counter[str] = Counter()
 
     def add(self, message: Message) -> list[Update]:
-        """Takes in a message; the updates that it leads to, none in batch mode.
-
-        Those of a recording or a device are on one clock already; of others only the stamps tell, see MessageClocks.
-        """
+        """Takes in a message whose clock only its stamp tells, see MessageClocks; the updates that it leads to, none in
+        batch mode."""
         timed = self._clocks.take(message, None, type(message).__name__)
-        if len(timed) == 1:
-            return self._add(timed[0])
-        return list(itertools.chain.from_iterable(map(self._add, timed)))
+        return list(itertools.chain.from_iterable(map(self.take, timed)))
 
-    def _add(self, message: Message) -> list[Update]:
+    def take(self, message: Message) -> list[Update]:
+        """The same for a message that is on one clock with all others, as those of a Recording are."""
         if isinstance(message, TruthMessage):
             self.truths.append(truth_row(message))
             return []
@@ -105,7 +102,7 @@ class Runner:
 
     def finish(self) -> list[Update]:
         """The updates of what still waits."""
-        updates = list(itertools.chain.from_iterable(map(self._add, self._clocks.flush())))
+        updates = list(itertools.chain.from_iterable(map(self.take, self._clocks.flush())))
         updates += [update for frame in self._assembler.flush() for update in self._take(frame)]
         updates += self._step()
         self.session.finish()

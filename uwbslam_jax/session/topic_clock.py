@@ -48,28 +48,29 @@ class TopicClock:
         messages."""
         self.usual += min(max(self.last - self.usual, -most), most) >> 2
 
-    def warnings(self) -> list[str]:
-        """What is wrong with its stamps, one line each; nothing of a truth."""
+    def told(self) -> dict[object, str]:
+        """What is wrong with its stamps by subject, which stays while counts grow; nothing of a truth."""
+        told: dict[object, str] = {}
         if self.kind is TruthMessage:
-            return []
-        told, heard = [], self.good + self.bare + self.bad
+            return told
+        heard = self.good + self.bare + self.bad
         if self.again:
-            told.append(
+            told[self.name, "again"] = (
                 f"{self.again} messages of {self.name} come again, stamp for stamp: a recording played in a loop (ros2 "
                 "bag play --loop); the repetition is left out"
             )
         if self.bare and self.known:
-            told.append(
+            told[self.name, "bare"] = (
                 f"{self.bare} of {heard} messages of {self.name} have no stamp, or one again and again: their log time "
                 "is taken; does its driver wait for a clock (use_sim_time)?"
             )
         if self.kind is not RangeMessage and self.twice > _MANY * heard:
-            told.append(
+            told[self.name, "twice"] = (
                 f"{self.twice} of {heard} messages of {self.name} have the stamp of the one before and are left out: "
                 "were two recordings of the same merged, or are the stamps whole seconds?"
             )
         if self.bad > _MANY * heard:
-            told.append(
+            told[self.name, "bad"] = (
                 f"{self.bad} of {heard} messages of {self.name} are dropped: their stamps do not go with those around "
                 "them; do two senders on different clocks share the topic?"
             )
@@ -110,16 +111,16 @@ def told_pause(length: int, after: int) -> str:
     )
 
 
-def told_jumps(jumps: list[Jump]) -> list[str]:
+def told_jumps(jumps: list[Jump]) -> dict[object, str]:
     """That clocks were set, the first few times one by one."""
-    told = [
-        f"stamps of {jump.names} jump {'back' if jump.change > 0 else 'forward'} by {_span(jump.change)} after "
+    told: dict[object, str] = {
+        k: f"stamps of {jump.names} jump {'back' if jump.change > 0 else 'forward'} by {_span(jump.change)} after "
         f"{jump.after / 1e9:.1f} s: a clock was set, or a recording played again; the run goes on without the jump "
         "(synchronise the clock before recording)"
-        for jump in jumps[:_MOST_TOLD]
-    ]
+        for k, jump in enumerate(jumps[:_MOST_TOLD])
+    }
     more = len(jumps) - _MOST_TOLD
-    return told + ([f"stamps jump {more} more times"] if more > 0 else [])
+    return told | ({"jumps": f"stamps jump {more} more times"} if more > 0 else {})
 
 
 def _span(ns: int) -> str:
