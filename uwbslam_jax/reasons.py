@@ -21,20 +21,22 @@ class Reason(str):
       words: why.
       advice: the likely cause and what helps.
       of: what is counted where that is not the measurement itself, such as the line that held it; else "".
+      told: whether what finds it out tells it, with its cause, wherever it is more than a few.
     """
 
     sensor: Sensor
     words: str
     advice: str
     of: str
+    told: bool
 
-    def __new__(cls, sensor: Sensor, words: str, advice: str, of: str = "") -> Reason:
+    def __new__(cls, sensor: Sensor, words: str, advice: str, of: str = "", *, told: bool = False) -> Reason:
         made = super().__new__(cls, f"{of or sensor}: {words}")
-        made.sensor, made.words, made.advice, made.of = sensor, words, advice, of
+        made.sensor, made.words, made.advice, made.of, made.told = sensor, words, advice, of, told
         return made
 
-    def __getnewargs__(self) -> tuple[Sensor, str, str, str]:
-        return self.sensor, self.words, self.advice, self.of
+    def __getnewargs_ex__(self) -> tuple[tuple[Sensor, str, str, str], dict[str, bool]]:
+        return (self.sensor, self.words, self.advice, self.of), {"told": self.told}
 
 
 _CLOCK = "a clock was set back, a recording is looped, or stamps are of another clock; uwbslam inspect shows them"
@@ -43,6 +45,8 @@ _APART, _AGAIN = "stamp apart from its neighbours'", "recorded before, in a loop
 """Words for what a clock tells of a message, whatever the sensor [text]."""
 _ONE_STAMP = "a driver that stamps some messages wrongly"
 """Advice for single stamps [text]."""
+_TWICE, _MERGED = "stamp of the one before", "two recordings of the same were merged, or stamps are whole seconds"
+"""Words and advice for a message at the time of the one before [text]."""
 _LOOP = "a recording that was played in a loop while it was recorded: its first pass is used"
 """Advice for what comes again [text]."""
 _BYTES = "bytes are damaged or do not fit the type that the recording gives; uwbslam inspect lists the types"
@@ -54,14 +58,19 @@ _LINE = "a loose or long cable, another baud, or a second program at the port"
 class ScanLost:
     """Of scans."""
 
-    APART = Reason(Sensor.SCAN, _APART, _ONE_STAMP)
-    AGAIN = Reason(Sensor.SCAN, _AGAIN, _LOOP)
+    APART = Reason(Sensor.SCAN, _APART, _ONE_STAMP, told=True)
+    AGAIN = Reason(Sensor.SCAN, _AGAIN, _LOOP, told=True)
     STAMP = Reason(Sensor.SCAN, "stamp not after the one before", _CLOCK)
+    TWICE = Reason(Sensor.SCAN, _TWICE, _MERGED, told=True)
     NO_BEARINGS = Reason(Sensor.SCAN, "no beams or no bearings", "the LiDAR's driver leaves its fields empty")
     NO_BEAMS = Reason(Sensor.SCAN, "no beams", "the LiDAR measures nothing, or its driver leaves the readings out")
     MALFORMED = Reason(Sensor.SCAN, "malformed", _BYTES)
-    OTHER_SCANNER = Reason(Sensor.SCAN, "of another scanner", "one topic holds several scanners; one of them is used")
-    IMPOSSIBLE = Reason(Sensor.SCAN, "impossible bearings", "the LiDAR's driver fills in angles that no scanner has")
+    OTHER_SCANNER = Reason(
+        Sensor.SCAN, "of another scanner", "one topic holds several scanners; one of them is used", told=True
+    )
+    IMPOSSIBLE = Reason(
+        Sensor.SCAN, "impossible bearings", "the LiDAR's driver fills in angles that no scanner has", told=True
+    )
     OVERTAKEN = Reason(
         Sensor.SCAN,
         "overtaken by a newer one",
@@ -77,8 +86,8 @@ class ScanLost:
 class RangeLost:
     """Of ranges."""
 
-    APART = Reason(Sensor.RANGE, _APART, _ONE_STAMP)
-    AGAIN = Reason(Sensor.RANGE, _AGAIN, _LOOP)
+    APART = Reason(Sensor.RANGE, _APART, _ONE_STAMP, told=True)
+    AGAIN = Reason(Sensor.RANGE, _AGAIN, _LOOP, told=True)
     IMPOSSIBLE = Reason(Sensor.RANGE, "not finite, not positive or too long", "another unit, or --uwb.max-range")
     NOT_POSITIVE = Reason(Sensor.RANGE, "not finite or not positive", "the radio reports failed exchanges as ranges")
     SELF = Reason(Sensor.RANGE, "a node to itself", "two radios have one id")
@@ -106,11 +115,15 @@ class RangeLost:
 class OdometryLost:
     """Of odometry."""
 
-    APART = Reason(Sensor.ODOMETRY, _APART, _ONE_STAMP)
-    AGAIN = Reason(Sensor.ODOMETRY, _AGAIN, _LOOP)
+    APART = Reason(Sensor.ODOMETRY, _APART, _ONE_STAMP, told=True)
+    AGAIN = Reason(Sensor.ODOMETRY, _AGAIN, _LOOP, told=True)
     NOT_FINITE = Reason(Sensor.ODOMETRY, "not finite", "the wheels' node reports no pose")
     NO_ROTATION = Reason(
-        Sensor.ODOMETRY, "orientation is no rotation", "the wheels' node leaves the quaternion at zero; mend it there"
+        Sensor.ODOMETRY,
+        "orientation is no rotation",
+        "the wheels' node leaves the quaternion at zero; mend it there",
+        told=True,
     )
+    TWICE = Reason(Sensor.ODOMETRY, _TWICE, _MERGED, told=True)
     STAMP = Reason(Sensor.ODOMETRY, "stamp not after the one before", _CLOCK)
     MALFORMED = Reason(Sensor.ODOMETRY, "malformed", _BYTES)

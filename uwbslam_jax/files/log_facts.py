@@ -20,6 +20,8 @@ _FEW = 20
 _OWN_M, _OWN_SPREAD_M, _WORLD_SPREAD_M = 0.7, 0.05, 0.5
 """A bearing whose readings are all this near and spread no more than that sees the robot itself, where half of the
 others spread more than the last: the robot moved [m]."""
+_AT_LIMIT = 0.01
+"""So many of the readings that are the sensor's own limit mean no return [ratio]."""
 
 
 @dataclass
@@ -42,6 +44,8 @@ class LogFacts:
     _pauses: list[tuple[float, float]] = field(default_factory=list)
     _scans: int = 0
     _timed: bool = False
+    _readings: int = 0
+    _at_limit: Counter[float] = field(default_factory=Counter)
     _least: np.ndarray = field(default_factory=lambda: np.zeros(0))
     _most: np.ndarray = field(default_factory=lambda: np.zeros(0))
     _wheels: OdometryTrack = field(default_factory=OdometryTrack)
@@ -86,6 +90,10 @@ class LogFacts:
         self.beams = max(self.beams, size)
         self._timed = self._timed or message.time_increment != 0
         self._scans += 1
+        self._readings += size
+        if math.isfinite(message.range_max):  # within the rounding of single precision
+            at = int(np.count_nonzero(np.isclose(message.ranges, message.range_max, rtol=1e-6, atol=0.0)))
+            self._at_limit[message.range_max] += at
         if len(self._least) != size:  # of several sizes only the first that stays is looked at
             if self._scans > _FEW:
                 return
@@ -114,6 +122,10 @@ class LogFacts:
             lines.append(f"scans have {self._fewest} to {self.beams} readings")
         if not self._timed:
             lines.append("scans have no time_increment: if the LiDAR turns, its sweeps are bent by the robot's motion")
+        for limit, count in self._at_limit.most_common(1):
+            if count > _AT_LIMIT * self._readings:
+                share = 100 * count / self._readings
+                lines.append(f"no return is told as range_max, {limit:.4g} m ({share:.0f} % of the readings)")
         with np.errstate(invalid="ignore"):
             spread = self._most - self._least
             own = (self._most < _OWN_M) & (spread < _OWN_SPREAD_M)

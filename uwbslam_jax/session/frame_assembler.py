@@ -124,7 +124,7 @@ class FrameAssembler:
             self._intervals.append(scan.stamp - self._scan_at)
         self._scan_at = max(scan.stamp, self._scan_at or scan.stamp)
         if self._last is not None and scan.stamp <= self._last:
-            self.dropped[ScanLost.STAMP] += 1
+            self.dropped[ScanLost.TWICE if scan.stamp == self._last else ScanLost.STAMP] += 1
             return []
         if scan.ranges.size < 2 or not np.isfinite([scan.angle_min, scan.angle_increment]).all():
             self.dropped[ScanLost.NO_BEARINGS] += 1
@@ -173,7 +173,8 @@ class FrameAssembler:
             self.dropped[OdometryLost.NOT_FINITE] += 1
             return []
         if self._odometry and message.stamp <= self._odometry[-1].stamp:
-            self.dropped[OdometryLost.STAMP] += 1
+            again = message.stamp == self._odometry[-1].stamp
+            self.dropped[OdometryLost.TWICE if again else OdometryLost.STAMP] += 1
             return []
         self.used[Sensor.ODOMETRY] += 1
         message, joined = self.wheels.join(message)

@@ -18,7 +18,8 @@ _PLURAL = {Sensor.SCAN: "scans", Sensor.RANGE: "ranges", Sensor.ODOMETRY: "odome
 
 
 def losses(used: Mapping[Sensor, int], dropped: Mapping[str, int], least: int = 1) -> dict[Sensor, str]:
-    """A line for each sensor of which more than a fifth was lost: how much, why, and what helps.
+    """A line for each sensor of which more than a fifth was lost: how much, why, and what helps. What is told already
+    where it is found out is not told again.
 
     Args:
       used: measurements that went into frames.
@@ -28,7 +29,9 @@ def losses(used: Mapping[Sensor, int], dropped: Mapping[str, int], least: int = 
     told = {}
     for sensor in Sensor:
         own = {why: n for why, n in dropped.items() if isinstance(why, Reason) and why.sensor is sensor and n > 0}
-        lost, kept = sum(own.values()), used.get(sensor, 0)
+        told_already = sum(n for why, n in own.items() if why.told)
+        own = {why: n for why, n in own.items() if not why.told}
+        lost, kept = sum(own.values()), used.get(sensor, 0) + told_already
         if lost > MANY * (lost + kept) and lost >= (max(FEW, least) if kept else least):
             often = sorted(own, key=lambda why: -own[why])
             share = f"{lost} of {lost + kept}" if kept else f"all {lost}"

@@ -172,7 +172,7 @@ class MessageClocks:
     def _good(self, own: TopicClock, message: Message, stamp: int, log: int | None) -> Message:
         """A message with its stamp on the common clock; its topic goes on from it."""
         out = stamp + own.shift
-        own.twice += own.known and log is not None and stamp == own.stamp
+        own.twice += own.known and stamp == own.stamp
         own.stamp = stamp
         if log is not None:
             own.log = log

@@ -12,7 +12,7 @@ import numpy as np
 
 from uwbslam_jax import __version__, process
 from uwbslam_jax.numerics import turned
-from uwbslam_jax.reasons import Sensor
+from uwbslam_jax.reasons import Reason, Sensor
 from uwbslam_jax.result import BeaconEstimate, BeaconStatus, Result, RunStatus
 from uwbslam_jax.session.history import History
 from uwbslam_jax.session.losses import blank_scans, losses, unplaced
@@ -133,7 +133,8 @@ def _seen(session: Session, facts: Facts) -> bool:
 
 def _unplaced(session: Session, facts: Facts) -> list[str]:
     """A warning where no beacon was placed although ranges were wanted; that all were lost is told already."""
-    used, lost = facts.used[Sensor.RANGE], Sensor.RANGE in losses(facts.used, facts.dropped)
+    used = facts.used[Sensor.RANGE]
+    lost = any(isinstance(why, Reason) and why.sensor is Sensor.RANGE for why in +facts.dropped)
     if session.settings.filter.lidar_only or (lost and not used):
         return []
     robot, seen = session.settings.robot.id, _seen(session, facts)
