@@ -225,6 +225,41 @@ CASES: dict[str, Case] = {
         lambda rows: each(UWB, called({0: 27}))(of_the_robot(rows)), told=("--robot.id 27",), good=of_the_robot
     ),
     "reboot_new_id": Case(each(UWB, called({20: 120}), HALF), near, noted="note: node 120 is first heard after 2."),
+    "scan_mm": Case(each(SCAN, times(ranges=1000.0, range_min=1000.0, range_max=1000.0)), near, ("taken for mm",)),
+    "scan_mm_limits_m": Case(each(SCAN, times(ranges=1000.0)), near, ("taken for mm",)),
+    "scan_cm": Case(each(SCAN, times(ranges=100.0)), near, ("taken for cm",)),
+    "scan_limits_wrong": Case(
+        each(SCAN, fields(range_max=0.5)), same, ("range_min and range_max: these are not used",)
+    ),
+    "scan_limits_swapped": Case(each(SCAN, fields(range_min=30.0, range_max=0.1)), same),
+    "stamps_us": Case(
+        each(ALL, lambda row: row.later(row.stamp // 1000 - row.stamp, log=False)),
+        near,
+        ("stamps of /scan pass 0.001 times", "stamps of /uwb/ranges pass 0.001 times"),
+    ),
+    "uwb_stamps_us": Case(
+        each(UWB, lambda row: row.later(row.stamp // 1000 - row.stamp, log=False)),
+        near,
+        ("stamps of /uwb/ranges pass 0.001 times",),
+    ),
+    "uwb_stamps_counter": Case(
+        each(UWB, lambda row: row.later(T0 + 64 * (row.stamp - T0) - row.stamp, log=False)),
+        near,
+        ("stamps of /uwb/ranges pass 64 times",),
+    ),
+    "uwb_stamps_ms": Case(
+        each(UWB, lambda row: row.later(1000 * (row.stamp - T0) - row.stamp + S, log=False)),
+        near,
+        ("stamps of /uwb/ranges pass 1e+03 times",),
+    ),
+    "stamps_whole_seconds": Case(
+        each(UWB, lambda row: row.later(-(row.stamp % S), log=False)),
+        near,
+        ("stamps of /uwb/ranges are whole seconds",),
+    ),
+    "increment_sign": Case(each(SCAN, times(angle_increment=-1.0)), same, ("if the map is mirrored",)),
+    "log_all_zero": Case(each(ALL, lambda row: setattr(row, "log", 0))),
+    "no_stamp_at_all": Case(each(ALL, lambda row: setattr(row, "stamp", 0)), near),
 }
 
 

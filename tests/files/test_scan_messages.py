@@ -33,6 +33,7 @@ def read(messages: list[SimpleNamespace], frame: str = "") -> tuple[list[ScanMes
     for m in messages[:FIRST_LOOK]:
         reader.take(m, m.stamp, Counter())
     reader.settle()
+    reader.settle_time(1.0)
     scans = [scan for m in messages for scan in reader.take(m, m.stamp, dropped)]
     return [scan for scan in scans if isinstance(scan, ScanMessage)], reader, dropped
 
@@ -62,6 +63,7 @@ DEGREE = math.degrees(1.0)
         ({"angle_increment": STEP * 456 / 451}, "ends"),
         ({"angle_increment": STEP * 3.0}, "ends"),  # beyond a turn
         ({"angle_increment": STEP / 4.0}, "ends"),  # three of four readings left out
+        ({"angle_increment": -STEP}, "sign"),
         ({"angle_increment": STEP * DEGREE}, "degrees"),
         ({"angle_min": FIRST * DEGREE, "angle_max": LAST * DEGREE}, "degrees"),
         ({"angle_min": FIRST * DEGREE, "angle_max": LAST * DEGREE, "angle_increment": STEP * DEGREE}, "degrees"),

@@ -177,7 +177,7 @@ def _settle_robot(first: FirstRanges, options: Options) -> None:
         if other is not None and not still:
             options.told.append(
                 f"robot.id = {wanted} rests among the others, and node {other} is the one whose ranges change: "
-                f"if that is the robot's, say --robot.id {other}"
+                f"if that is the robot's, say --robot.id {other}; or do two nodes share that id?"
             )
         return
     heard = "is heard by one node only" if wanted in nodes else "is never heard"

@@ -134,12 +134,12 @@ def inspect_log(
                 problems.append(f"no {role} topic")
         except LogError as error:
             problems.append(str(error))
-    look_first(recording, decoders, roles, options)
+    rates = look_first(recording, decoders, roles, options)
     ranges = {number: decode for number, decode in decoders.items() if roles[number] == "uwb"}
     look_ahead(recording, ranges, options, scans=bool({"scan", "odom"} & set(roles.values())))
     topic_of = {channel.id: channel.topic for channel in recording.channels.values()}
     clocks = {topic: _Clock() for topic in topic_of.values()}
-    heard, on_clock = LogFacts(), MessageClocks(options.dropped)
+    heard, on_clock = LogFacts(), MessageClocks(options.dropped, rates)
     for log_time, number, data in recording.records():
         if number not in topic_of:
             continue

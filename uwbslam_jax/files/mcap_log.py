@@ -34,6 +34,7 @@ from uwbslam_jax.files.schemas import (
     plausible,
     unpacker,
 )
+from uwbslam_jax.files.stamp_rates import stamp_rates
 from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, ScanMessage, TruthMessage
 from uwbslam_jax.session import MessageClocks
 from uwbslam_jax.settings import UwbSettings
@@ -96,7 +97,7 @@ class Recording:
         except LogError as error:
             broken = f"; {self._recording.truncated}" if self._recording.truncated else ""
             raise LogError(f"{self.name}: {' '.join(str(error).split())}{broken}") from None
-        look_first(self._recording, self._decoders, self._roles, self._options)
+        self._rates = look_first(self._recording, self._decoders, self._roles, self._options)
         channels = self._recording.channels
         self.topics: dict[str, Role] = {channels[number].topic: role for number, role in self._roles.items()}
         self._warnings: list[str] = []
@@ -136,12 +137,12 @@ class Recording:
     def truth(self) -> Truth | None:
         """Where robot and beacons were, None where the recording has no truth of the robot; read through for it."""
         wanted = {number: decode for number, decode in self._decoders.items() if self._roles[number] == "truth"}
-        poses = [m for m in self._timed(MessageClocks(), wanted) if isinstance(m, TruthMessage)]
+        poses = [m for m in self._timed(MessageClocks(rates=self._rates), wanted) if isinstance(m, TruthMessage)]
         return Truth.from_messages(poses) if any(m.node is None for m in poses) else None
 
     def __iter__(self) -> Iterator[Message]:
         self._options.dropped.clear()
-        clocks = MessageClocks(self._options.dropped)
+        clocks = MessageClocks(self._options.dropped, self._rates)
         self._of_clocks = []
         yield from self._timed(clocks, self._decoders)
         self._of_clocks = clocks.warnings
@@ -183,13 +184,18 @@ def choose_topics(
     return decoders, roles
 
 
-def look_first(recording: Bag, decoders: dict[int, Decoder], roles: dict[int, Role], options: Options) -> None:
-    """Reads the first scans, which tell how their driver means the rest."""
+def look_first(
+    recording: Bag, decoders: dict[int, Decoder], roles: dict[int, Role], options: Options
+) -> dict[str, float]:
+    """Reads the first messages: scans tell how their driver means the rest. What `stamp_rates` tells is returned."""
     scans = {number for number, role in roles.items() if role == "scan" and recording.counts[number]}
     for log_time, number, data in islice(recording.records(scans) if scans else (), FIRST_LOOK):
         decoders[number](data, log_time)
     options.scans.settle()
+    rates = stamp_rates(recording, decoders)
+    options.scans.settle_time(min((rates.get(recording.channels[number].topic, 1.0) for number in scans), default=1.0))
     options.dropped.clear()
+    return rates
 
 
 def _discover(recording: Bag, role: Role, options: Options) -> dict[int, Decoder]:

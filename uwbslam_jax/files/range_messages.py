@@ -187,7 +187,7 @@ def range_taker(layout: Layout, topic: str, options: Options) -> Callable[[Any, 
                 target += _OTHER_NODE * (other if other != own else int(layout.apart))
             metres = measured * METRES[unit if options.unit == "auto" else options.unit] * options.scale
             powers = [float(get[path](place)) if path else math.nan for path in layout.powers]
-            at = _time(get[layout.stamp](place)) if layout.stamp else stamp_of(place.levels[-1], stamp)
+            at = nanoseconds(get[layout.stamp](place)) if layout.stamp else stamp_of(place.levels[-1], stamp)
             found += checked(RangeMessage(at or stamp, source, target, metres, *powers), options)
         return found
 
@@ -217,7 +217,7 @@ def topic_name(topic: str, topics: list[str]) -> str:
     return "/".join(step for k, step in enumerate(steps) if any(other[k : k + 1] != [step] for other in others))
 
 
-def _time(value: Any) -> int:
+def nanoseconds(value: Any) -> int:
     """Nanoseconds of a ROS time, of seconds as a float, or of an integer of nanoseconds."""
     if isinstance(value, float | np.floating):
         return round(float(value) * 1e9)

@@ -43,6 +43,11 @@ _BLUR = 0.05
 """A no return at range_max that a simulator added noise to lies within this of it [ratio]."""
 _NOISE_BELOW = 1.5
 """So far below the limit as the farthest reading lies beyond it the noise may reach [ratio]."""
+_FARTHEST_M, _USUAL_M = 100.0, 5.0
+"""Readings of which three quarters are larger are no metres: of the units below the one that brings them nearest to
+the second [m]."""
+_LENGTHS = {"cm": 0.01, "mm": 0.001}
+"""What readings are given in by mistake [m]."""
 _FEWEST_SCANS = 5
 """Fewer tell no interval [scans]."""
 _RENAMED_S = 2.0
@@ -61,6 +66,8 @@ _AMISS = {
     "degrees": "bearings of the scans are in degrees: they are converted",
     "ends": "angle_increment of the scans does not fit angle_min, angle_max and the number of readings: they are taken "
     "as spread evenly from angle_min to angle_max",
+    "sign": "angle_increment of the scans has the other sign than angle_max - angle_min: they are taken as spread from "
+    "angle_min to angle_max; if the map is mirrored say --robot.lidar-flip",
     "header": "angle_max of the scans does not fit angle_min, angle_increment and the number of readings: angle_max is "
     "not used; see whether the map is bent or mirrored (--robot.lidar-flip)",
     "refused": "scans are left out: with their number of readings neither angle_increment nor angle_max stays within "
@@ -72,11 +79,13 @@ _AMISS = {
 @dataclass
 class _Facts:
     """What the first scans of a scanner said, one value each: stamp [ns], time [s] and bearing [rad] from the first
-    reading to the last."""
+    reading to the last, what a quarter of the readings is below [m], whether none of them is within its limits."""
 
     stamps: list[int] = field(default_factory=list)
     sweeps: list[float] = field(default_factory=list)
     spans: list[float] = field(default_factory=list)
+    nearer: list[float] = field(default_factory=list)
+    outside: list[bool] = field(default_factory=list)
 
     def interval(self) -> float | None:
         """Usual time between scans [s], None where there are too few."""
@@ -87,7 +96,7 @@ class _Facts:
 
 class ScanReader:
     """Scans out of the messages of a recording. The first of them are read twice: until `settle` is called they only
-    tell how their driver means what it says.
+    tell how their driver means what it says, and what it says of times once `settle_time` is.
 
     Attributes:
       frame: frame_id of the scanner that is used; None while none is known.
@@ -102,8 +111,9 @@ class ScanReader:
         self.told: dict[str, str] = {}
         self._chosen = bool(frame)
         self._facts: defaultdict[str, _Facts] | None = defaultdict(_Facts)
+        self._own = _Facts()
         self._last = 0
-        self._interval, self._time_scale = 0.0, 1.0
+        self._interval, self._time_scale, self._scale, self._limited = 0.0, 1.0, 1.0, True
         self._equal: Counter[float] = Counter()
         self._no_return: list[float] = []
 
@@ -120,10 +130,15 @@ class ScanReader:
             names = ", ".join(name or "none" for name in sorted(self.frames))
             self.told["scanners"] = f"no scan has the frame_id {self.frame} of --lidar.frame: there are {names}"
         self.frames.clear()
-        own = facts.get(self.frame, _Facts())
-        interval = own.interval()
-        if interval is not None:
-            self._learn_time(own, interval)
+        self._own = facts.get(self.frame, _Facts())
+        self._learn_lengths(self._own)
+
+    def settle_time(self, rate: float) -> None:
+        """Settles what time_increment is given in, once it is known how many times as fast as time stamps pass; 0 where
+        they do not tell."""
+        interval = self._own.interval()
+        if interval is not None and rate > 0.0:
+            self._learn_time(self._own, interval / rate)
 
     def take(self, message: Any, stamp: int, dropped: Counter[str]) -> list[Message]:
         """The scan of a LaserScan, ROS's or Foxglove's; none, counted, where there is none to be used."""
@@ -154,8 +169,13 @@ class ScanReader:
             self.told[bearings.amiss] = _AMISS[bearings.amiss]
         if self._facts is not None:
             self._look(self._facts[frame], stamp, bearings, ranges.size, time_increment)
+            self._look_at_lengths(self._facts[frame], ranges, limits)
         else:
             time_increment = self._timed(time_increment, bearings.increment)
+        if self._scale != 1.0:
+            ranges = ranges * np.float32(self._scale)
+            limits = (limits[0] * self._scale, limits[1] * self._scale) if limits[1] > _FARTHEST_M else limits
+        limits = limits if self._limited else (0.0, math.inf)
         ranges = self._returns(ranges, limits)
         return [ScanMessage(stamp, bearings.first, bearings.increment, time_increment, *limits, ranges)]
 
@@ -187,6 +207,35 @@ class ScanReader:
         facts.stamps.append(stamp)
         facts.sweeps.append(abs(time_increment) * (readings - 1))
         facts.spans.append(abs(bearings.increment) * (readings - 1))
+
+    def _look_at_lengths(self, facts: _Facts, ranges: np.ndarray, limits: tuple[float, float]) -> None:
+        seen = ranges[(ranges > 0.0) & (ranges < math.inf)]
+        seen = seen[seen < seen.max()] if seen.size else seen  # the largest may mean no return
+        if 2 * seen.size > ranges.size:
+            facts.nearer.append(float(np.quantile(seen, 0.25)))
+            facts.outside.append(not ((seen > limits[0]) & (seen < limits[1])).any())
+
+    def _learn_lengths(self, facts: _Facts) -> None:
+        """Finds the unit of readings that are no metres, and limits that no reading keeps."""
+        if len(facts.nearer) < _FEWEST_SCANS:
+            return
+        typical = float(np.median(facts.nearer))
+        if typical > _FARTHEST_M:
+            unit = min(_LENGTHS, key=lambda name: abs(math.log(typical * _LENGTHS[name] / _USUAL_M)))
+            self._scale = _LENGTHS[unit]
+            self._equal.clear()
+            self._no_return.clear()
+            self.told.pop("no return", None)
+            self.told["lengths"] = (
+                f"readings of the scans, {typical:.0f} as a rule, are taken for {unit}, so for "
+                f"{typical * self._scale:.1f} m; see the LiDAR's driver"
+            )
+        elif all(facts.outside):
+            self._limited = False
+            self.told["limits"] = (
+                "no reading of the scans is between their range_min and range_max: these are not used; see the LiDAR's "
+                "driver, or say --lidar.min-range and --lidar.max-range"
+            )
 
     def _learn_time(self, facts: _Facts, interval: float) -> None:
         """Finds what time_increment is given in, where a sweep would last longer than the time between scans."""
@@ -264,6 +313,8 @@ def _bearings(first: float, last: float, increment: float, readings: int) -> _Be
     span = last - first
     if not _within_a_turn(span):
         return _Bearings(first, increment, "header") if fits else None
+    if fits and abs(span + increment * steps) <= _END_SLACK * abs(increment):
+        return _Bearings(first, span / steps, "sign")
     if fits:
         ratio = span / (increment * steps)
         thinned = ratio > 1.5 and abs(ratio - round(ratio)) < 0.02 * ratio

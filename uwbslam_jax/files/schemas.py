@@ -30,7 +30,7 @@ from uwbslam_jax.files.range_layouts import (
     find_layout,
     one_a_topic,
 )
-from uwbslam_jax.files.range_messages import Options, fast_range, range_taker
+from uwbslam_jax.files.range_messages import Options, fast_range, nanoseconds, range_taker
 from uwbslam_jax.files.ros_types import STORE, UWB_RANGE
 from uwbslam_jax.files.scan_messages import foxglove_protobuf
 from uwbslam_jax.measurements import Message
@@ -270,10 +270,7 @@ def _stamp(message: Any, otherwise: int = 0) -> int:
     """Time of a message [ns]: its header's, or its own; another where it has neither, or 0."""
     time = getattr(message, "header", message)
     time = getattr(time, "stamp", None) or getattr(time, "timestamp", None)
-    if time is None:
-        return otherwise
-    nanosec = getattr(time, "nanosec", None)
-    return int(time.sec) * 1_000_000_000 + int(time.nsec if nanosec is None else nanosec) or otherwise
+    return otherwise if time is None else nanoseconds(time) or otherwise
 
 
 _TAKE: dict[Role, Callable[[Any, Options], list[Message]]] = {

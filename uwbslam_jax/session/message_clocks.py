@@ -8,9 +8,10 @@ that of the scans. What is in doubt waits, with all behind it, until what follow
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from statistics import median_low
+from types import MappingProxyType
 from typing import NamedTuple
 
 from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, ScanMessage, TruthMessage
@@ -70,7 +71,7 @@ class _Held(NamedTuple):
             return False
         own = self.own
         stuck = own.known and self.stamp == own.stamp and abs(self.off + own.shift - own.usual) > _NEAR
-        return stuck or not 0 < self.stamp < _ABSURD
+        return stuck or own.rate != 1.0 or not 0 < self.stamp < _ABSURD
 
     @property
     def off(self) -> int:
@@ -95,10 +96,16 @@ class MessageClocks:
       dropped: what was not given back, by reason.
     """
 
-    def __init__(self, dropped: Counter[str] | None = None):
-        """dropped: where losses are counted, a counter of its own if not given."""
+    def __init__(self, dropped: Counter[str] | None = None, rates: Mapping[str, float] = MappingProxyType({})):
+        """Nothing has come yet.
+
+        Args:
+          dropped: where losses are counted, a counter of its own if not given.
+          rates: topics whose stamps tell no time, and how many times as fast as the log's they pass.
+        """
         self.dropped: Counter[str] = Counter() if dropped is None else dropped
         self._topics: dict[str, TopicClock] = {}
+        self._rates = rates
         self._held: deque[_Held] = deque()
         self._reference: TopicClock | None = None
         self._newest: TopicClock | None = None  # the last good message's, not of the truth
@@ -119,7 +126,7 @@ class MessageClocks:
         """
         own = self._topics.get(topic)
         if own is None:
-            own = self._topics[topic] = TopicClock(topic, type(message))
+            own = self._topics[topic] = TopicClock(topic, type(message), rate=self._rates.get(topic, 1.0))
         stamp = message.stamp
         if log_time is not None:
             if log_time < self._raw_log - _LOG_BACK:

@@ -20,6 +20,7 @@ class TopicClock:
       stamp, log: of its last good message [ns]. shift: what its stamps are moved by [ns].
       usual: difference of moved stamps to the log time [ns]. known: whether a message was good.
       good, bad, bare, twice: messages, those dropped, those without a stamp, those with the stamp of the one before.
+      rate: how many times as fast as the log its stamps pass if they tell no time, 0 if they are whole seconds; else 1.
       begin: its first stamps. until: those up to it come again; again: so many messages do.
     """
 
@@ -34,6 +35,7 @@ class TopicClock:
     bad: int = 0
     bare: int = 0
     twice: int = 0
+    rate: float = 1.0
     begin: set[int] = field(default_factory=set)
     until: int = 0
     again: int = 0
@@ -58,6 +60,12 @@ class TopicClock:
             told[self.name, "again"] = (
                 f"{self.again} messages of {self.name} come again, stamp for stamp: a recording played in a loop (ros2 "
                 "bag play --loop); the repetition is left out"
+            )
+        if self.rate != 1.0:
+            how = f"pass {self.rate:.3g} times as fast as the log's" if self.rate else "are whole seconds"
+            told[self.name, "rate"] = (
+                f"stamps of {self.name} {how}: their log time is taken; are they in another unit (ms, us), or "
+                "a counter of the device?"
             )
         if self.bare and self.known:
             told[self.name, "bare"] = (
