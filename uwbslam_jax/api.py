@@ -341,21 +341,25 @@ def tune(
       progress: told what is being done.
 
     Raises:
-      ConfigError: a name is unknown or a setting out of range. LogError: see `run`. RolloutError: start-up decides
-        nothing, too few frames follow, or there is no truth to tune for.
+      ConfigError: a name is unknown, a setting out of range, or the LiDAR's place is asked of recordings whose
+        transforms tell different ones. LogError: see `run`. UsageError: there is no recording. RolloutError: start-up
+        decides nothing, too few frames follow, or there is no truth to tune for.
     """
     wanted = settings_file.check(settings or Settings())
     check_request(tuple(params), wanted)
     one = isinstance(recordings, str | Path | Recording | Simulation) or _are_messages(recordings)
     logs = []
     for source in cast(Sequence[Source], [recordings] if one else recordings):
-        messages, settings = _opened(source, settings)
+        messages, own = _opened(source, settings)
         name = messages.name if isinstance(messages, Recording) else f"recording {len(logs) + 1}"
         kept = list(messages)
         truths = [m for m in kept if isinstance(m, TruthMessage)]
         known = any(m.node is None for m in truths)
-        logs.append(Log(name, kept, Truth.from_messages(truths) if known else None))
-    return tune_logs(logs, tuple(params), settings_file.check(settings or Settings()), objective, progress)
+        logs.append(Log(name, kept, own, Truth.from_messages(truths) if known else None))
+    if not logs:
+        raise UsageError("there is no recording to tune from")
+    base = settings or dataclasses.replace(logs[0].settings, robot=Settings().robot)
+    return tune_logs(logs, tuple(params), base, objective, progress)
 
 
 def rollout(source: Source, settings: Settings | None = None) -> Rollout:

@@ -16,8 +16,8 @@ from uwbslam_jax.errors import ConfigError
 from uwbslam_jax.estimator import ranging
 from uwbslam_jax.files.settings_file import differences, from_dict
 from uwbslam_jax.numerics.se2_host import between, compose
-from uwbslam_jax.settings import Settings
-from uwbslam_jax.tuning import calibration, fit, parameters, rollout
+from uwbslam_jax.settings import RobotSettings, Settings
+from uwbslam_jax.tuning import Log, calibration, fit, parameters, rollout, tune
 from uwbslam_jax.tuning.likelihood import Objective, Score
 
 STEPS = 56
@@ -228,3 +228,28 @@ def test_mounting_and_biases_are_found_or_told_as_not_observed(wheels):
         # with the yaw as configured the LiDAR sits where the antenna is the same as seen from it
         seen = rotated(-MOUNTING[2], ANTENNA - MOUNTING[:2])
         np.testing.assert_allclose(ANTENNA - found[K : K + 2], seen, atol=0.02)
+
+
+def test_each_recording_is_explained_by_its_own_robot(monkeypatch: pytest.MonkeyPatch):
+    seen = []
+
+    def calibrate(messages, settings, names):
+        seen.append(settings.robot)
+        one = np.ones(len(names))
+        return calibration.Calibration(tuple(names), 0 * one, 0.1 * one, one, ("",) * len(names))
+
+    monkeypatch.setattr(calibration, "calibrate", calibrate)
+
+    def tuned(robots: list[RobotSettings], name: str) -> Settings:
+        logs = [Log("a", [], Settings(robot=robot), None) for robot in robots]
+        seen.clear()
+        found = tune(logs, (name,), Settings(), "likelihood", lambda text: None).settings
+        assert seen == robots
+        return found
+
+    turned, shifted = RobotSettings(lidar=(0.0, 0.0, 3.0), id=27), RobotSettings(lidar=(0.2, 0.0, 0.0))
+    assert tuned([turned, shifted], "bias.3").robot == RobotSettings()
+    assert tuned([turned, turned], "bias.3").robot == turned
+    assert tuned([turned, turned], "lidar.x").robot.lidar == (0.1, 0.0, 3.0)
+    with pytest.raises(ConfigError, match="tune it of each by itself"):
+        tuned([turned, shifted], "lidar.x")

@@ -224,7 +224,8 @@ def _discover(recording: Bag, role: Role, options: Options) -> dict[int, Decoder
     fitting = {number: decoder for number, (rank, decoder) in spoken.items() if rank == best}
     topics = sorted({recording.channels[number].topic for number in fitting})
     if len(topics) > 1:
-        raise LogError(f"several {role} topics: {', '.join(topics)}; choose with --{_KEYS[role]} TOPIC")
+        several = ", with * for several" if role == "uwb" else ""
+        raise LogError(f"several {role} topics: {', '.join(topics)}; choose with --{_KEYS[role]} TOPIC{several}")
     if not fitting and role == "odom":
         return _odometry_in_transforms(recording, options)
     if not fitting:

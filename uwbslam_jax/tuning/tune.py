@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,10 +25,12 @@ _BLOCK = 10
 
 
 class Log(NamedTuple):
-    """A recording: what it is called, its messages, and its ground truth where it has some."""
+    """A recording: what it is called, its messages, its settings with what it tells of its robot, and its ground truth
+    where it has some."""
 
     name: str
     messages: Sequence[Message]
+    settings: Settings
     truth: Truth | None
 
 
@@ -37,7 +39,7 @@ class Tuned:
     """What was found.
 
     Attributes:
-      settings: those given, with what was found.
+      settings: those given, with what was found and what all recordings tell of their robot alike.
       calibration: range biases and mounting, None where none was asked for; noises: likewise.
       objective: what the noises were fitted to.
     """
@@ -78,13 +80,14 @@ def check_request(names: tuple[str, ...], settings: Settings) -> tuple[str, ...]
 def tune(
     logs: Sequence[Log], names: tuple[str, ...], settings: Settings, goal: Goal, progress: Callable[[str], object]
 ) -> Tuned:
-    """Geometry from all recordings, then noises with that geometry.
+    """Geometry from all recordings, then noises with that geometry; each with its own robot.
 
     Args:
       names: of the parameters, the preset's defaults where there are none. goal: what noises are tuned for.
 
     Raises:
-      ConfigError: an unknown name, or settings without ranges. RolloutError: a recording that tells nothing of them.
+      ConfigError: an unknown name, settings without ranges, or the LiDAR's place asked of recordings that tell
+        different ones. RolloutError: a recording that tells nothing of them.
     """
     names = check_request(names, settings)
     if goal == "truth" and (without := [log.name for log in logs if log.truth is None]):
@@ -92,12 +95,19 @@ def tune(
     geometry = [name for name in names if not parameters.is_noise(name)]
     noises = tuple(name for name in names if parameters.is_noise(name))
     calibrated = found = objective = None
+    robots = [log.settings.robot for log in logs]
+    if all(robot == robots[0] for robot in robots):
+        settings = replace(settings, robot=robots[0])
+    elif asked := [name for name in geometry if name in parameters.MOUNTING]:
+        raise ConfigError(f"{asked[0]}: the recordings tell of different robots; tune it of each by itself")
     if geometry:
-        parts = [_told(log, "mounting and biases", progress, calibration.calibrate, settings, geometry) for log in logs]
+        parts = [_told(log, "mounting and biases", progress, calibration.calibrate, geometry) for log in logs]
         calibrated = calibration.together(parts)
-        settings = parameters.configured(settings, dict(zip(geometry, calibrated.values.tolist(), strict=True)))
+        values = dict(zip(geometry, calibrated.values.tolist(), strict=True))
+        settings = parameters.configured(settings, values)
+        logs = [log._replace(settings=parameters.configured(log.settings, values)) for log in logs]
     if noises:
-        rollouts = [_told(log, "start-up", progress, prepare, settings) for log in logs]
+        rollouts = [_told(log, "start-up", progress, prepare) for log in logs]
         pieces: list[Piece] = [piece(one, log.truth) for one, log in zip(rollouts, logs, strict=True)]
         start = np.log([max(parameters.value(settings, name), 1e-9) for name in noises])
         progress("compiling")
@@ -108,10 +118,10 @@ def tune(
 
 
 def _told(log: Log, what: str, progress: Callable[[str], object], function: Callable, *arguments: Any) -> Any:
-    """A function of one recording's messages; what it cannot use is told with the recording's name."""
+    """A function of one recording's messages and settings; what it cannot use is told with the recording's name."""
     progress(f"{log.name}: {what}")
     try:
-        return function(log.messages, *arguments)
+        return function(log.messages, log.settings, *arguments)
     except RolloutError as error:
         raise RolloutError(f"{log.name}: {error}") from None
 
