@@ -32,6 +32,17 @@ def each(topics: str | tuple[str, ...], change: Callable[[Row], object], since: 
 ALL = (SCAN, UWB, ODOM)
 
 
+def every(topic: str, n: int, change: Callable[[Row], object]) -> Fault:
+    """A fault of every n-th message of a topic."""
+
+    def spoil(rows: Rows) -> Rows:
+        for row in of(rows, topic)[::n]:
+            change(row)
+        return rows
+
+    return spoil
+
+
 def fields(**values: object) -> Callable[[Row], object]:
     """Sets fields of a message."""
     return lambda row: [setattr(row.message, name, value) for name, value in values.items()]

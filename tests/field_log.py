@@ -14,6 +14,7 @@ import numpy as np
 import small_room as room
 import transform_log
 from room_drive import BEACONS, pose_at
+from rosbags.typesys.store import Typestore
 
 from uwbslam_jax import api
 from uwbslam_jax.files import ros_types
@@ -117,9 +118,9 @@ def wheels(t: float) -> tuple[float, float, float]:
 
 
 @cache
-def _drive() -> Rows:
+def _drive(seconds: int) -> Rows:
     rng, rows = np.random.default_rng(4), []
-    for k in range(50):
+    for k in range(10 * seconds):
         stamp = T0 + k * S // 10
         rows.append(Row(SCAN, stamp + 2_000_000, _scan(rng, pose_at(k / 10), stamp)))
         nodes = {0: pose_at(k / 10 + 0.05)[:2], **BEACONS} if k % 2 else {}
@@ -138,10 +139,10 @@ def _wheels() -> Rows:
     return [Row(ODOM, at + 500_000, odometry(at, wheels((at - T0) / S))) for at in times]
 
 
-def drive(*, with_wheels: bool = False) -> Rows:
-    """Five seconds of scans at 10 Hz, ranges at 5 Hz of all pairs of the robot and three beacons, wheels at 20 Hz if
-    wanted; to be changed as one likes."""
-    return copy.deepcopy(_drive() + (_wheels() if with_wheels else []))
+def drive(seconds: int = LONG // S, *, with_wheels: bool = False) -> Rows:
+    """Scans at 10 Hz, ranges at 5 Hz of all pairs of the robot and three beacons, wheels at 20 Hz for the first five
+    seconds if wanted; to be changed as one likes."""
+    return copy.deepcopy(_drive(seconds) + (_wheels() if with_wheels else []))
 
 
 def still(turn: transform_log.Turn, frame: str = "laser") -> Row:
@@ -178,10 +179,10 @@ def hear(path: Path, settings: Settings | None = None) -> Heard:
     return Heard(chosen, frames, told, dropped, str(api.inspect(path, settings)))
 
 
-def written(path: Path, rows: Rows) -> Path:
-    """A recording of these rows in the order of their arrival."""
+def written(path: Path, rows: Rows, store: Typestore = ros_types.STORE) -> Path:
+    """A recording of these rows in the order of their arrival; store: with their types."""
     ordered = sorted(rows, key=lambda row: row.arrival)
-    return transform_log.write(path, [(row.topic, row.log, row.message) for row in ordered])
+    return transform_log.write(path, [(row.topic, row.log, row.message) for row in ordered], store)
 
 
 def points(heard: Heard, frame: StampedFrame) -> np.ndarray:

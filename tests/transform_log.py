@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rosbags.typesys.store import Typestore
 
 from uwbslam_jax.files import ros_types
 from uwbslam_jax.files.mcap_container import RecordWriter
@@ -38,17 +39,19 @@ def transform(stamp: int, parent: str, child: str, place: Turn = (0, 0, 0), turn
     return build("tf2_msgs/msg/TFMessage", transforms=[stamped])
 
 
-def write(path: Path, messages: list[tuple[str, int, Any]]) -> Path:
-    """A recording of (topic, log time [ns], built message or measurement)."""
+def write(path: Path, messages: list[tuple[str, int, Any]], store: Typestore = ros_types.STORE) -> Path:
+    """A recording of (topic, log time [ns], built message or measurement); store: with the types of built messages."""
     with RecordWriter(path) as writer:
         channels: dict[str, int] = {}
         for topic, log_time, message in messages:
             if isinstance(message, ScanMessage | RangeMessage):
                 schema, data = ros_types.encode(message)
             else:
-                schema, data = message.__msgtype__, ros_types.serialize(message)
+                schema = message.__msgtype__
+                data = bytes(store.serialize_cdr(message, schema, little_endian=True))
             if topic not in channels:
-                channels[topic] = writer.add_topic(topic, schema, ros_types.definition(schema))
+                text = store.generate_msgdef(schema, ros_version=2)[0]
+                channels[topic] = writer.add_topic(topic, schema, text.encode())
             writer.write(channels[topic], data, log_time)
     return path
 

@@ -64,6 +64,9 @@ class ScanLost:
     TWICE = Reason(Sensor.SCAN, _TWICE, _MERGED, told=True)
     NO_BEARINGS = Reason(Sensor.SCAN, "no beams or no bearings", "the LiDAR's driver leaves its fields empty")
     NO_BEAMS = Reason(Sensor.SCAN, "no beams", "the LiDAR measures nothing, or its driver leaves the readings out")
+    FAILED = Reason(
+        Sensor.SCAN, "no return right after some that had", "the LiDAR fails at times; see its cable, supply and driver"
+    )
     MALFORMED = Reason(Sensor.SCAN, "malformed", _BYTES)
     OTHER_SCANNER = Reason(
         Sensor.SCAN, "of another scanner", "one topic holds several scanners; one of them is used", told=True

@@ -20,6 +20,7 @@ from field_faults import (
     called,
     clockwise,
     each,
+    every,
     fields,
     in_transforms,
     invalid,
@@ -40,11 +41,16 @@ from field_faults import (
     unchanged,
     upside_down,
 )
+from field_formats import FORMATS, published
 from field_log import BEAMS, HALF, ODOM, SCAN, T0, UWB, Heard, S, drive, hear, points, still
 
+import uwbslam_jax as us
+from uwbslam_jax.result import Result
 from uwbslam_jax.settings import LidarSettings, Settings, UwbSettings
 
 HOUR = 3600 * S
+RUN_S = 24
+"""So long a drive decides where its beacons are [s]."""
 DEFAULTS = Settings()
 
 
@@ -100,6 +106,12 @@ def one_scan_less(found: Heard, good: Heard) -> None:
     assert sum(found.dropped.values()) == 1
     assert len(found.frames) == len(good.frames) - 1
     seen = {f.frame.scan.ranges.tobytes() for f in good.frames}
+    assert all(f.frame.scan.ranges.tobytes() in seen for f in found.frames)
+
+
+def fewer_scans(found: Heard, good: Heard) -> None:
+    seen = {f.frame.scan.ranges.tobytes() for f in good.frames}
+    assert 0 < len(found.frames) < len(good.frames)
     assert all(f.frame.scan.ranges.tobytes() in seen for f in found.frames)
 
 
@@ -225,6 +237,13 @@ CASES: dict[str, Case] = {
         lambda rows: each(UWB, called({0: 27}))(of_the_robot(rows)), told=("--robot.id 27",), good=of_the_robot
     ),
     "reboot_new_id": Case(each(UWB, called({20: 120}), HALF), near, noted="note: node 120 is first heard after 2."),
+    "gap_2h": Case(each(ALL, lambda row: row.later(2 * HOUR), HALF), but_one_gap, noted="nothing was measured for 72"),
+    "scans_fail_at_times": Case(
+        every(SCAN, 3, readings(np.zeros_like)),
+        told=("16 of 50 scans were left out",),
+        right=fewer_scans,
+        noted="note: 17 scans hold no return",
+    ),
     "scan_mm": Case(each(SCAN, times(ranges=1000.0, range_min=1000.0, range_max=1000.0)), near, ("taken for mm",)),
     "scan_mm_limits_m": Case(each(SCAN, times(ranges=1000.0)), near, ("taken for mm",)),
     "scan_cm": Case(each(SCAN, times(ranges=100.0)), near, ("taken for cm",)),
@@ -286,3 +305,42 @@ def test_what_is_wrong_is_mended_or_told(tmp_path: Path, name: str) -> None:
     plain = hear(tmp_path / "a.mcap") if case.settings != DEFAULTS else found
     for part in (case.noted,) if case.noted else case.told:
         assert [line for line in plain.inspected.splitlines() if part in line], plain.inspected
+
+
+TOLD = {
+    "sensor_range": ("nodes have names",),
+    "counter_of_the_radio": ("pass 64 times as fast",),
+}
+"""What is told of some formats."""
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_ranges_in_other_packages_messages(tmp_path: Path, name: str) -> None:
+    good = _good(of_the_robot, False, tmp_path / "good.mcap")
+    rows, store = published(of_the_robot(drive()), name)
+    found = hear(field_log.written(tmp_path / "a.mcap", rows, store))
+    near(found, good)
+    for line, part in zip(found.told, TOLD.get(name, ()), strict=True):
+        assert part in line
+        assert line in found.inspected
+
+
+@pytest.fixture(scope="module")
+def good_run(tmp_path_factory: pytest.TempPathFactory) -> Result:
+    return us.run(field_log.written(tmp_path_factory.mktemp("good") / "a.mcap", drive(RUN_S)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name", ["clock_back", "clock_1970", "gap_2h", "uwb_clock_off", "bag_looped", "stamps_us", "scans_fail_at_times"]
+)
+def test_a_run_ends_where_that_of_the_good_recording_does(tmp_path: Path, good_run: Result, name: str) -> None:
+    found = us.run(field_log.written(tmp_path / "a.mcap", CASES[name].spoil(drive(RUN_S))))
+    found.save(tmp_path / "out")
+    places = [{beacon.id: beacon.position for beacon in run.beacons} for run in (good_run, found)]
+    assert sorted(places[0]) == sorted(places[1]) == [10, 20, 30]
+    for a, b in ((10, 20), (10, 30), (20, 30)):
+        apart = [np.linalg.norm(place[a] - place[b]) for place in places]
+        assert apart[0] == pytest.approx(apart[1], abs=0.05)
+    way = [np.linalg.norm(run.poses[-1, :2] - run.poses[0, :2]) for run in (good_run, found)]
+    assert way[0] == pytest.approx(way[1], abs=0.05)

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
 import zstandard
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from uwbslam_jax.errors import LogError
-from uwbslam_jax.files import LogWriter, Recording, ros_types
+from uwbslam_jax.files import LogWriter, Recording, inspect_log, ros_types
 from uwbslam_jax.measurements import Message, RangeMessage, ScanMessage
 
 MS = 1_000_000
@@ -26,7 +28,7 @@ def drive(count: int = 30) -> list[Message]:
     """A scan every 100 ms and a range with each."""
     ranges = np.linspace(1.0, 2.0, 40, dtype=np.float32)
     times = [T0 + k * 100 * MS for k in range(count)]
-    scans: list[Message] = [ScanMessage(t, -1.5, 0.25, 0.0, 0.125, 30.0, ranges) for t in times]
+    scans: list[Message] = [ScanMessage(t, -1.5, 0.125, 0.0, 0.125, 30.0, ranges) for t in times]
     heard: list[Message] = [RangeMessage(t + MS, 0, 1 + k % 3, 2.5 + k, -80.0, -82.0) for k, t in enumerate(times)]
     return [message for pair in zip(scans, heard, strict=True) for message in pair]
 
@@ -65,39 +67,80 @@ def write_db3(path: Path, messages: list[Message]) -> Path:
     return path
 
 
-def write_ros1(path: Path, messages: list[Message]) -> Path:
+def ros1_store() -> Any:
     store: Any = get_typestore(Stores.ROS1_NOETIC)
     store.register(get_types_from_msg(ros_types.UWB_RANGE_TEXT, ros_types.UWB_RANGE))
+    return store
+
+
+def in_ros1(store: Any, message: Message) -> tuple[str, bytes]:
+    """Type and bytes of a message in ROS 1."""
     humble: Any = ros_types.STORE
-    with Ros1Writer(path) as writer:
+    schema, data = ros_types.encode(message)
+    filled = humble.deserialize_cdr(data, schema)
+    header = store.types["std_msgs/msg/Header"](0, filled.header.stamp, filled.header.frame_id)
+    fields = {n: getattr(filled, n) for n in store.types[schema].__dataclass_fields__ if n != "__msgtype__"}
+    return schema, bytes(store.serialize_ros1(store.types[schema](**fields | {"header": header}), schema))
+
+
+def write_ros1(path: Path, messages: list[Message], packed: Any = None) -> Path:
+    """packed: how its chunks are compressed."""
+    store, writer = ros1_store(), Ros1Writer(path)
+    if packed is not None:
+        writer.set_compression(packed)
+    with writer:
         connections = {}
         for message in messages:
-            schema, data = ros_types.encode(message)
+            schema, data = in_ros1(store, message)
             if schema not in connections:
                 connections[schema] = writer.add_connection(topic_of(message), schema, typestore=store)
-            filled = humble.deserialize_cdr(data, schema)
-            header = store.types["std_msgs/msg/Header"](0, filled.header.stamp, filled.header.frame_id)
-            fields = {n: getattr(filled, n) for n in store.types[schema].__dataclass_fields__ if n != "__msgtype__"}
-            data = store.serialize_ros1(store.types[schema](**fields | {"header": header}), schema)
             writer.write(connections[schema], message.stamp, data)
+    return path
+
+
+def write_plain(
+    path: Path, messages: list[Message], pack: Callable[[bytes], bytes] = bytes, *, ros1: bool = False, **options: Any
+) -> Path:
+    """By the mcap package; pack: what is done to each message's bytes, options: of its writer."""
+    store = ros1_store()
+    with path.open("wb") as file:
+        writer = Writer(file, **options)
+        writer.start("ros1" if ros1 else "ros2")
+        channels: dict[str, int] = {}
+        for message in messages:
+            schema, data = in_ros1(store, message) if ros1 else ros_types.encode(message)
+            if schema not in channels and ros1:
+                text = store.generate_msgdef(schema, ros_version=1)[0].encode()
+                number = writer.register_schema(schema.replace("/msg/", "/"), "ros1msg", text)
+                channels[schema] = writer.register_channel(topic_of(message), "ros1", number)
+            elif schema not in channels:
+                number = writer.register_schema(schema, "ros2msg", ros_types.definition(schema))
+                channels[schema] = writer.register_channel(topic_of(message), "cdr", number)
+            writer.add_message(channels[schema], message.stamp, pack(data), message.stamp)
+        writer.finish()
     return path
 
 
 def write_compressed_messages(path: Path, messages: list[Message]) -> Path:
     """As rosbag2 does with compression mode message."""
-    with path.open("wb") as file:
-        writer = Writer(file, compression=CompressionType.NONE)
-        writer.start("ros2")
-        channels: dict[str, int] = {}
-        for message in messages:
-            schema, data = ros_types.encode(message)
-            if schema not in channels:
-                number = writer.register_schema(schema, "ros2msg", ros_types.definition(schema))
-                channels[schema] = writer.register_channel(topic_of(message), "cdr", number)
-            packed = zstandard.ZstdCompressor().compress(data)
-            writer.add_message(channels[schema], message.stamp, packed, message.stamp)
-        writer.finish()
-    return path
+    return write_plain(path, messages, zstandard.ZstdCompressor().compress, compression=CompressionType.NONE)
+
+
+def write_without_sizes(path: Path, messages: list[Message]) -> Path:
+    """Chunks compressed by a stream, which does not know how long it will be."""
+    with mock.patch("zstandard.compress", zstandard.ZstdCompressor(write_content_size=False).compress):
+        return write_plain(path, messages)
+
+
+def write_without_index(path: Path, messages: list[Message]) -> Path:
+    """Neither summary nor index, as some recorders leave a file."""
+    off = ("use_statistics", "use_summary_offsets", "repeat_channels", "repeat_schemas")
+    return write_plain(path, messages, index_types=IndexType.NONE, **dict.fromkeys(off, False))
+
+
+def write_unsorted(path: Path, messages: list[Message]) -> Path:
+    order = np.random.default_rng(0).permutation(len(messages))
+    return write_plain(path, [messages[k] for k in order])
 
 
 def write_zstd(path: Path, messages: list[Message]) -> Path:
@@ -122,6 +165,21 @@ KINDS: dict[str, Callable[[Path, list[Message]], Path]] = {
     "a_0.db3.zstd": write_db3_zstd,
     "messages_0.mcap": write_compressed_messages,
 }
+PACKED: dict[str, Callable[[Path, list[Message]], Path]] = {
+    "lz4.mcap": partial(write_plain, compression=CompressionType.LZ4),
+    "none.mcap": partial(write_plain, compression=CompressionType.NONE),
+    "unchunked.mcap": partial(write_plain, use_chunking=False),
+    "nocrc.mcap": partial(write_plain, enable_crcs=False),
+    "noindex.mcap": write_without_index,
+    "zstd_nosize.mcap": write_without_sizes,
+    "unsorted.mcap": write_unsorted,
+    "ros1.mcap": partial(write_plain, ros1=True),
+    "bz2.bag": partial(write_ros1, packed=Ros1Writer.CompressionFormat.BZ2),
+    "lz4.bag": partial(write_ros1, packed=Ros1Writer.CompressionFormat.LZ4),
+    "bag.mcap": write_ros1,
+    "mcap.bag": write_mcap,
+}
+"""The same in other ways of packing; the last two are named as the other."""
 
 
 def metadata(folder: Path, names: list[str]) -> None:
@@ -129,10 +187,11 @@ def metadata(folder: Path, names: list[str]) -> None:
     (folder / "metadata.yaml").write_text(f"rosbag2_bagfile_information:\n  relative_file_paths:\n{listed}")
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", [*KINDS, *PACKED])
 def test_every_container_gives_the_same_messages(tmp_path: Path, name: str) -> None:
     wanted = [key(message) for message in drive()]
-    path = KINDS[name](tmp_path / name, drive())
+    path = (KINDS | PACKED)[name](tmp_path / name, drive())
+    assert not inspect_log(path).problems
     for source in (path, tmp_path):  # alone, and in a folder without metadata
         reader = Recording(source)
         for _ in range(2):

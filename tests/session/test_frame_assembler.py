@@ -411,3 +411,21 @@ def test_ranges_that_are_stamped_late_are_put_back() -> None:
     ages = [f.frame.ranges.age[f.frame.ranges.valid].tolist() for f in frames]
     assert ages == [[], [pytest.approx(-0.8)], [pytest.approx(-0.8)]]
     assert not make.dropped
+
+
+def test_ranges_before_a_pause_are_a_frame_of_their_own():
+    frames = list(assembler().frames([scan(0.1), ranged(0.15), scan(7200.2), ranged(7200.25), scan(7200.3)]))
+    assert [f.stamp for f in frames] == [at(0.1), at(0.15), at(7200.2), at(7200.3)]
+    assert [bool(f.frame.has_scan) for f in frames] == [True, False, True, True]
+    assert len(taken(frames[1:2])) == 1
+    assert all(f.frame.ranges.age.min() > -1.0 for f in frames)
+
+
+def test_a_scan_without_a_return_amid_others_is_a_failure_and_seeing_nothing_is_none():
+    make, stream = assembler(), [scan(0.1 * k) for k in range(20)]
+    for k in [3, 5, *range(10, 20)]:
+        stream[k] = dataclasses.replace(stream[k], ranges=np.zeros_like(stream[k].ranges))
+    frames = list(make.frames(stream))
+    assert make.dropped == {"scan: no return right after some that had": 6}
+    assert len(frames) == 14
+    assert make.blank == 6

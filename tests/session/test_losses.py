@@ -70,7 +70,7 @@ def test_more_than_a_fifth_is_told(used: dict[Sensor, int], dropped: dict[str, i
 def test_scans_without_a_return_are_told_where_they_are_most() -> None:
     frames = FrameAssembler(SMALL, max_ranges=2)
     for k, reading in enumerate([2.0, np.inf, np.inf]):
-        frames.add(ScanMessage(1 + k, 0.0, 0.1, 0.0, 0.1, 30.0, np.full(20, reading, np.float32)))
+        frames.add(ScanMessage((1 + k) * 1_000_000_000, 0.0, 0.1, 0.0, 0.1, 30.0, np.full(20, reading, np.float32)))
     assert (frames.used[Sensor.SCAN], frames.blank) == (3, 2)
     assert blank_scans(3, 2)[0].startswith("2 of 3 scans hold no return")
     assert not blank_scans(0, 0) + blank_scans(4, 2)

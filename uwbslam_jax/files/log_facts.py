@@ -45,6 +45,7 @@ class LogFacts:
     _scans: int = 0
     _timed: bool = False
     _readings: int = 0
+    _blank: int = 0
     _at_limit: Counter[float] = field(default_factory=Counter)
     _least: np.ndarray = field(default_factory=lambda: np.zeros(0))
     _most: np.ndarray = field(default_factory=lambda: np.zeros(0))
@@ -94,11 +95,12 @@ class LogFacts:
         if math.isfinite(message.range_max):  # within the rounding of single precision
             at = int(np.count_nonzero(np.isclose(message.ranges, message.range_max, rtol=1e-6, atol=0.0)))
             self._at_limit[message.range_max] += at
+        seen = np.isfinite(message.ranges) & (message.ranges > 0)
+        self._blank += not seen.any()
         if len(self._least) != size:  # of several sizes only the first that stays is looked at
             if self._scans > _FEW:
                 return
             self._least, self._most = np.full(size, np.inf), np.zeros(size)
-        seen = np.isfinite(message.ranges) & (message.ranges > 0)
         near = np.where(seen, message.ranges, np.inf)
         np.minimum(self._least, near, out=self._least)
         np.maximum(self._most, near, out=self._most)
@@ -120,6 +122,7 @@ class LogFacts:
         lines = []
         if self._fewest != self.beams:
             lines.append(f"scans have {self._fewest} to {self.beams} readings")
+        lines += [f"{self._blank} scans hold no return"] if self._blank else []
         if not self._timed:
             lines.append("scans have no time_increment: if the LiDAR turns, its sweeps are bent by the robot's motion")
         for limit, count in self._at_limit.most_common(1):

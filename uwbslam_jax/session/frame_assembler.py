@@ -33,6 +33,10 @@ from uwbslam_jax.settings import Settings, make_config, with_room
 
 _SCANLESS_S = 1.0
 """Ranges wait this long for a scan before they make a frame of their own."""
+_PAUSE = 2_000_000_000
+"""Ranges that came so long before a scan [ns] make a frame of their own: by its time the robot is elsewhere."""
+_FAILS = 500_000_000
+"""A scan without a return so soon after one that had some [ns] is a failure of the scanner; later it sees nothing."""
 _BLIND_S, _BLIND_SCANS = 0.2, 2
 """Once a LiDAR has fallen silent they wait only so long, or so many of its usual intervals where those are longer: no
 velocity predicts a turning robot for a second, but a slow scanner is not a silent one."""
@@ -85,6 +89,7 @@ class FrameAssembler:
         self._odometry: list[OdometryMessage] = []
         self._last: int | None = None
         self._scan_at: int | None = None
+        self._seen_at = -_FAILS  # stamp of the last scan with a return
         self._wait_s = _SCANLESS_S
         self._intervals: deque[int] = deque(maxlen=_INTERVALS)  # between scans [ns]
 
@@ -128,6 +133,11 @@ class FrameAssembler:
             return []
         if scan.ranges.size < 2 or not np.isfinite([scan.angle_min, scan.angle_increment]).all():
             self.dropped[ScanLost.NO_BEARINGS] += 1
+            return []
+        if ((scan.ranges > scan.range_min) & (scan.ranges < scan.range_max)).any():
+            self._seen_at = scan.stamp
+        elif scan.stamp - self._seen_at < _FAILS:
+            self.dropped[ScanLost.FAILED] += 1
             return []
         self.used[Sensor.SCAN] += 1
         waiting = self._without_scan(before=scan.stamp)
@@ -232,7 +242,10 @@ class FrameAssembler:
             ]
             rest = self._ranges[len(ready) :]
             overdue = before is None or (before - first > self._wait_s * 1.5e9) or len(self._ranges) > self._max_ranges
-            if not overdue or (before is not None and (ready[-1].stamp >= before or not rest)):
+            if not overdue:
+                break
+            # the last ones belong to what comes next, unless that comes after a pause
+            if before is not None and (ready[-1].stamp >= before or (not rest and before - ready[-1].stamp <= _PAUSE)):
                 break
             self._ranges = rest
             self._wait_s = self._silent_wait()
