@@ -36,8 +36,9 @@ _SEARCH_HEADINGS, _SEARCH_BEAMS, _SEARCH_REFINED = 120, 180, 8
 _UNLIKELY = 0.005
 """What a squared Mahalanobis distance of one costs a searched place, in mean Gamma: as if 100 beams were independent.
 Headings cost little: the search is for a robot that turned."""
-_TURN = 1.0
-"""A turn that counts as a distance of one [rad]."""
+_TURN = 0.6
+"""A turn that counts as a distance of one [rad]: in real corridors turns of up to 80 degrees between two scans are
+found with it, and scans that would fit turned by half are not."""
 
 
 class Match(NamedTuple):
@@ -47,8 +48,10 @@ class Match(NamedTuple):
       pose: (3,) the robot's pose in the map [m, m, rad].
       information: (3, 3) Gram matrix of the residuals at that pose, unscaled (H^(LiD) of the paper).
       informed: (2, 2) projector on the directions in which it tells the position.
-      score: mean Gamma of the returns that fall on observed cells; about 0.8 when right, 0.4 when not.
+      score: mean Gamma of the returns that fall on observed cells; about 0.8 when right, 0.4 when not, and 0.6 when
+        right where the walls were drawn from few scans, dotted.
       known: share of the returns that fall on observed cells.
+      blurred: the score against the middle level, whose cells a dotted wall fills: 0.8 and 0.35.
     """
 
     pose: Float[Array, "3"]
@@ -56,6 +59,7 @@ class Match(NamedTuple):
     informed: Float[Array, "2 2"]
     score: Float[Array, ""]
     known: Float[Array, ""]
+    blurred: Float[Array, ""]
 
 
 class Blind(NamedTuple):
@@ -296,21 +300,28 @@ def assess(grid: Grid, view: View, pose: Float[Array, "3"], resolution: float) -
     sweep = view.sweep
     gram = lidar_gram(pose, grid.levels[0], grid.origin, resolution, sweep.points, sweep.valid)
     score, known = fit(grid, sweep, pose, resolution)
+    middle = _middle(grid)
+    blurred, _ = fit(grid, sweep, pose, resolution, middle)
     ends = transform_points(pose, sweep.points)
-    on_wall, _ = on_known_wall(grid, ends, resolution, min(1, len(grid.levels) - 1))
+    on_wall, _ = on_known_wall(grid, ends, resolution, middle)
     informed = seen(blind_direction(view.surface, sweep.valid & on_wall), pose[2])
     projector = jnp.eye(3).at[:2, :2].set(informed)
     information = projector @ gram[:3, :3] @ projector
-    return Match(pose, information, informed, score, known)
+    return Match(pose, information, informed, score, known, blurred)
+
+
+def _middle(grid: Grid) -> int:
+    return min(1, len(grid.levels) - 1)
 
 
 def fit(
-    grid: Grid, sweep: Sweep, pose: Float[Array, "3"], resolution: float
+    grid: Grid, sweep: Sweep, pose: Float[Array, "3"], resolution: float, level: int = 0
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Score and known share of a scan at a pose, see Match, against the finest level."""
+    """Score and known share of a scan at a pose, see Match, against a level."""
+    size = resolution * 2**level
     ends = transform_points(pose, sweep.points)
-    corners, at, inside = occupancy.corner_log_odds(grid.levels[0], grid.origin, resolution, ends)
-    value, _ = occupancy.interpolate(jax.nn.sigmoid(corners), at, resolution)
+    corners, at, inside = occupancy.corner_log_odds(grid.levels[level], grid.origin, size, ends)
+    value, _ = occupancy.interpolate(jax.nn.sigmoid(corners), at, size)
     observed = sweep.valid & inside & jnp.any(corners != 0, axis=(1, 2))
     count = jnp.sum(observed)
     score = jnp.sum(jnp.where(observed, value, 0.0)) / jnp.maximum(count, 1)
@@ -338,14 +349,16 @@ def search(
     around the last pose, because a robot that turned has often driven less far than its velocity said.
 
     Every heading and position is scored at the middle level; the best of each peak over the headings is aligned and
-    scored at the finest, where it has to be better than the pose that was found without searching.
+    scored there again, where it has to be better than the pose that was found without searching. At the finest level
+    a wrong pose scores more than the right one in every tenth sparse scan of a real corridor, at the middle one in
+    every hundredth, and of such that stand 0.6 m off or are turned by less than half, in none.
 
     Args:
       expected: pose; its position weighs in the choice, its heading does not.
       last: pose; found: without searching.
     """
     sweep = view.sweep
-    k = min(1, len(grid.levels) - 1)
+    k = _middle(grid)
     size = resolution * 2**k
     stride = max(1, sweep.points.shape[0] // _SEARCH_BEAMS)
     points, valid = sweep.points[::stride], sweep.valid[::stride]
@@ -377,11 +390,11 @@ def search(
     def refine(start: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, ""]]:
         wide = Gaussian(start, jnp.diag(jnp.array([0.3, 0.3, 0.3]) ** 2))
         pose = align(grid, view, start, wide, resolution)
-        m = assess(grid, view, pose, resolution)
-        away = pose[None, :2] - centres
+        score, known = fit(grid, sweep, pose, resolution, k)
+        away = pose[:2] - centres[0]
         turned = wrap_angle(pose[2] - jnp.stack([expected.mean[2], last[2]])) / _TURN
-        unlikely = jnp.min(jnp.sum((away @ information) * away, axis=1)) + jnp.min(turned**2)
-        return pose, (m.score - 0.5) * m.known - _UNLIKELY * unlikely
+        unlikely = away @ information @ away + jnp.min(turned**2)
+        return pose, (score - 0.5) * known - _UNLIKELY * unlikely
 
     poses, values = lax.map(refine, starts)
     pose = poses[jnp.argmax(values)]
