@@ -114,6 +114,10 @@ class Graph:
         """(N,) whether a keyframe's scan does not tell where it is in some direction."""
         return is_blind(self.keyframes["informed"])
 
+    def hangs_on(self) -> np.ndarray:
+        """(N,) whether a keyframe is known relative to the one before: its scan was matched, or wheels measured."""
+        return np.any(self.keyframes["informed"] != 0, axis=(1, 2)) | self.rolled()
+
     def rolled(self) -> np.ndarray:
         """(N,) whether wheels measured all the way from the keyframe before."""
         return np.isfinite(self.keyframes["wheels"][:, 0])

@@ -20,7 +20,7 @@ from uwbslam_jax.backend.graph import Graph
 from uwbslam_jax.backend.smoothing import Solution
 from uwbslam_jax.estimator import State, anchored, state_vector
 from uwbslam_jax.mapping import Grid, Tiles, draw_onto, redraw
-from uwbslam_jax.numerics import SIGMA_ENOUGH_M, SingularError, between, compose, largest_sigma, wrapped
+from uwbslam_jax.numerics import SIGMA_ENOUGH_M, SingularError, between, compose, largest_sigma, rigid_fit, wrapped
 from uwbslam_jax.settings import Config, Params
 
 UNSOLVED = (SingularError, np.linalg.LinAlgError)
@@ -172,15 +172,27 @@ def take_over(config: Config, params: Params, revision: Revision, state: State, 
     solution, count = revision.solution, len(revision.solution.poses)
     slots, places, at = _current(solution, graph)
     last = graph.poses()[count - 1]
-    poses = np.concatenate([solution.poses, compose(solution.poses[-1], between(last, graph.poses()[count:]))])
-    seen, way = graph.seen(poses, count), float(state.map_spread.way)
-    grid = draw_onto(config, params, revision.tiles, revision.grid, seen, way)
     s = state_vector.unpack(state.belief.mean)
     old = np.asarray(state_vector.robot_pose(state.belief.mean), float)
     on_map = old + np.asarray(s.map_error, float)
-    pose = compose(solution.poses[-1], between(last, on_map))
+    since = np.concatenate([graph.poses()[count:], on_map[None]])
+    carried = compose(solution.poses[-1], between(last, since))
+    # where its heading was lost since, a robot is where it is among the beacons, not where the way since would lead
+    loose = ~graph.hangs_on()[count - 1 :]
+    if loose.any():
+        motion = rigid_fit(np.asarray(s.positions, float)[slots], places)
+        first = max(int(np.argmax(loose)) - 1, 0)
+        carried[first:] = compose(motion, np.concatenate([since[:-1], old[None]]))[first:]
+    poses = np.concatenate([solution.poses, carried[:-1]])
+    seen, way = graph.seen(poses, count), float(state.map_spread.way)
+    grid = draw_onto(config, params, revision.tiles, revision.grid, seen, way)
+    pose = carried[-1]
     pose[2] = old[2] + wrapped(pose[2] - old[2])
     cov = _cov(solution, at, pose, float(np.sum(np.hypot(*np.diff(poses[count - 1 :, :2], axis=0).T))))
+    if loose.any():
+        own = np.array(state_vector.pose_indices(len(s.positions)))
+        cov[:3], cov[:, :3] = 0.0, 0.0
+        cov[:3, :3] = np.asarray(state.belief.cov, float)[np.ix_(own, own)]
     others = [slot for slot in map(int, np.flatnonzero(np.asarray(state.active))) if slot > 0 and slot not in slots]
     values = np.concatenate([pose, places.ravel()])
     belief = anchored(state.belief, values, cov, slots, others)

@@ -349,9 +349,9 @@ def search(
     around the last pose, because a robot that turned has often driven less far than its velocity said.
 
     Every heading and position is scored at the middle level; the best of each peak over the headings is aligned and
-    scored there again, where it has to be better than the pose that was found without searching. At the finest level
-    a wrong pose scores more than the right one in every tenth sparse scan of a real corridor, at the middle one in
-    every hundredth, and of such that stand 0.6 m off or are turned by less than half, in none.
+    scored there again, where it has to be better than the pose that was found without searching. In real corridors
+    with scans a metre apart a wrong heading then beats the right one in one scan of a hundred, at the finest level in
+    one of forty.
 
     Args:
       expected: pose; its position weighs in the choice, its heading does not.
