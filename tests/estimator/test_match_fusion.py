@@ -48,7 +48,7 @@ def match(pose, score=0.85, known=1.0, informed=((1.0, 0.0), (0.0, 1.0))) -> Mat
     projector = np.eye(3)
     projector[:2, :2] = informed
     information = projector @ np.diag([9e3, 9e3, 9e4]) @ projector
-    return Match(*(jnp.asarray(x, jnp.float32) for x in (pose, information, informed, score, known)))
+    return Match(*(jnp.asarray(x, jnp.float32) for x in (pose, information, informed, score, known, score)))
 
 
 def frame(truth, dt=0.1, age=0.0):

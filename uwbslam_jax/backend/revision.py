@@ -171,25 +171,25 @@ def take_over(config: Config, params: Params, revision: Revision, state: State, 
     with the map."""
     solution, count = revision.solution, len(revision.solution.poses)
     slots, places, at = _current(solution, graph)
-    last = graph.poses()[count - 1]
     s = state_vector.unpack(state.belief.mean)
     old = np.asarray(state_vector.robot_pose(state.belief.mean), float)
     on_map = old + np.asarray(s.map_error, float)
+    hangs = graph.hangs_on()
+    firm = int(max(np.flatnonzero(hangs[:count]), default=count - 1))
     since = np.concatenate([graph.poses()[count:], on_map[None]])
-    carried = compose(solution.poses[-1], between(last, since))
-    # where its heading was lost since, a robot is where it is among the beacons, not where the way since would lead
-    loose = ~graph.hangs_on()[count - 1 :]
-    if loose.any():
-        motion = rigid_fit(np.asarray(s.positions, float)[slots], places)
-        first = max(int(np.argmax(loose)) - 1, 0)
-        carried[first:] = compose(motion, np.concatenate([since[:-1], old[None]]))[first:]
+    carried = compose(solution.poses[firm], between(graph.poses()[firm], since))
+    # a robot that has lost the map is where it is among the beacons, and not where the way since would lead
+    lost = ~np.append(hangs[count:], hangs[-1])
+    if lost.any():
+        among = compose(rigid_fit(np.asarray(s.positions, float)[slots], places), old)
+        carried[lost] = compose(among, between(on_map, since[lost]))
     poses = np.concatenate([solution.poses, carried[:-1]])
     seen, way = graph.seen(poses, count), float(state.map_spread.way)
     grid = draw_onto(config, params, revision.tiles, revision.grid, seen, way)
     pose = carried[-1]
     pose[2] = old[2] + wrapped(pose[2] - old[2])
     cov = _cov(solution, at, pose, float(np.sum(np.hypot(*np.diff(poses[count - 1 :, :2], axis=0).T))))
-    if loose.any():
+    if lost[-1] or firm < count - 1:
         own = np.array(state_vector.pose_indices(len(s.positions)))
         cov[:3], cov[:, :3] = 0.0, 0.0
         cov[:3, :3] = np.asarray(state.belief.cov, float)[np.ix_(own, own)]
