@@ -30,7 +30,12 @@ def published(
 
 
 def anchored(
-    belief: Gaussian, values: np.ndarray, cov: np.ndarray, slots: Sequence[int], apart: Sequence[int] = ()
+    belief: Gaussian,
+    values: np.ndarray,
+    cov: np.ndarray,
+    slots: Sequence[int],
+    apart: Sequence[int] = (),
+    error_cov: np.ndarray | None = None,
 ) -> Gaussian:
     """State vector and covariance from robot pose and beacons (3 + 2 B,); velocities turn with the frame.
 
@@ -39,6 +44,8 @@ def anchored(
 
     Args:
       values, cov: (3 + 2 B,), (3 + 2 B, 3 + 2 B). slots: of the beacons. apart: slots that are to stay as they are.
+      error_cov: (3, 6 + 2 B) covariance of the map's error with robot and beacons and with itself, where the pose was
+        not told by a match.
     """
     mean, P = np.array(belief.mean, float), np.array(belief.cov, float)
     nodes = state_vector.node_count(len(mean))
@@ -60,8 +67,9 @@ def anchored(
         P[np.ix_(rows, rows)] = own[np.ix_(rows, rows)]
     known = np.concatenate([pose, placed])
     P[np.ix_(known, known)] = cov
-    P[np.ix_(error, known)] = -cov[:3]
-    P[np.ix_(known, error)] = -cov[:, :3]
-    P[np.ix_(error, error)] = cov[:3, :3]
+    if error_cov is None:
+        error_cov = np.column_stack([-cov[:3], cov[:3, :3]])
+    P[np.ix_(error, known)], P[np.ix_(known, error)] = error_cov[:, :-3], error_cov[:, :-3].T
+    P[np.ix_(error, error)] = error_cov[:, -3:]
     mean[pose], mean[placed], mean[error] = values[:3], values[3:], 0.0
     return Gaussian(jnp.asarray(mean, jnp.float32), jnp.asarray(P, jnp.float32))

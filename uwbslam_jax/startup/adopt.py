@@ -13,11 +13,8 @@ from uwbslam_jax.numerics import between, compose, numeric_jacobian
 from uwbslam_jax.startup.keyframe_buffer import Buffer
 from uwbslam_jax.startup.placement import Placement
 
-
-def _last_and_beacons(placement: Placement) -> tuple[np.ndarray, np.ndarray]:
-    """Last keyframe's pose and the beacons as one vector, with their covariance."""
-    last = placement.poses.size - 3
-    return np.concatenate([placement.poses[-1], placement.beacons.ravel()]), placement.cov[last:, last:]
+_BY_MAP = slice(3, 6)
+"""Where the robot as its last scan has it stands behind the robot's own pose."""
 
 
 def adopt(
@@ -35,16 +32,29 @@ def adopt(
     before = np.array([key.pose for key in keys])
     pose = np.asarray(state_vector.robot_pose(state.belief.mean), float)
     onward = between(before[-1], pose)
-    x, cov = _last_and_beacons(placement)
-    y = partial(published, slots=placement.slots, frame_slots=frame_slots, onward=onward)
-    J = numeric_jacobian(y, x)
-    cov = J @ cov @ J.T
+    # the robot, and where the map has it: by its last scan and what was driven since
+    last, drawn = placement.poses[-1], placement.poses[placement.drawn]
+    since = compose(between(drawn, last), onward)
+    columns = placement.columns(len(keys) - 1, placement.drawn)
+    cov = placement.cov[np.ix_(columns, columns)]
+    frame = partial(published, slots=placement.slots, frame_slots=frame_slots)
+
+    def both(x: np.ndarray) -> np.ndarray:
+        robot, by_map = frame(np.delete(x, _BY_MAP), onward=onward), frame(x[3:], onward=since)
+        return np.concatenate([robot[:3], by_map])
+
+    x = np.concatenate([last, drawn, placement.beacons.ravel()])
+    J = numeric_jacobian(both, x)
+    cov, values = J @ cov @ J.T, both(x)
+    error_cov = np.column_stack([-np.delete(cov[_BY_MAP], _BY_MAP, axis=1), cov[_BY_MAP, _BY_MAP]])
+    values, cov = np.delete(values, _BY_MAP), np.delete(np.delete(cov, _BY_MAP, axis=0), _BY_MAP, axis=1)
     motion = frame_motion(placement.beacons, placement.slots, frame_slots)
     after = compose(motion, placement.poses)
-    belief = anchored(state.belief, y(x), cov, placement.slots)
+    belief = anchored(state.belief, values, cov, placement.slots, error_cov=error_cov)
     active = jnp.zeros(config.nodes, bool).at[jnp.array([0, *placement.slots])].set(True)
-    seen = [(pose, key.snapshot()) for pose, key in zip(after, keys, strict=True) if bool(key.frame.frame.has_scan)]
-    grid = redraw(config, view.params, tiles, seen, y(x)[:2])
+    scans = [key.matched and bool(key.frame.frame.has_scan) for key in keys]
+    seen = [(pose, key.snapshot()) for pose, key, scan in zip(after, keys, scans, strict=True) if scan]
+    grid = redraw(config, view.params, tiles, seen, values[:2])
     adopted = state._replace(
         belief=belief,
         active=active,
@@ -52,6 +62,6 @@ def adopt(
         scatter=state.scatter._replace(log=jnp.asarray(buffer.scatter(config.nodes), jnp.float32)),
         grid=grid,
         map_spread=state.map_spread._replace(epoch=jnp.ones(())),
-        drawn_pose=jnp.asarray(y(x)[:3], jnp.float32),
+        drawn_pose=jnp.asarray(values[:3], jnp.float32),
     )
     return adopted, tiles, Moved(np.array([key.frame.stamp for key in keys]), before, after)

@@ -15,7 +15,6 @@ import numpy as np
 from uwbslam_jax.estimator import published
 from uwbslam_jax.numerics import CALIBRATED_M, DECIDED, SIGMA_ENOUGH_M, largest_sigma, numeric_jacobian
 from uwbslam_jax.result import RunStatus
-from uwbslam_jax.startup.adopt import _last_and_beacons
 from uwbslam_jax.startup.hypotheses import explanations
 from uwbslam_jax.startup.keyframe_buffer import Buffer
 from uwbslam_jax.startup.placement import Placement, Problem
@@ -86,8 +85,10 @@ def _explain(problem: Problem) -> tuple[list[Placement], float]:
 def _keep_certain(placement: Placement, ids: dict[int, int], *, drawn: bool) -> Placement | None:
     """The beacons whose place in the published frame is certain, None where the robot's own is not.
 
-    The start frame is no measure: all beacons turn together with the heading that the track started with. Where no map
-    is drawn, nothing is lost by a frame that is known less well: the filter only has to be near enough to be linear.
+    The start frame is no measure: all beacons turn together with the heading that the track started with. What the
+    robot drove by wheels since its last scan is no matter: the map hangs on that scan, and the next one tells. Where
+    no map is drawn, nothing is lost by a frame that is known less well: the filter only has to be near enough to be
+    linear.
     """
     if len(placement.slots) < 2:
         return None
@@ -97,7 +98,9 @@ def _keep_certain(placement: Placement, ids: dict[int, int], *, drawn: bool) -> 
         span = float(np.max(np.linalg.norm(placement.beacons - placement.beacons[0], axis=1)))
         sigma_enough, heading_enough = max(sigma_enough, _UNDRAWN_SIGMA * span), _UNDRAWN_HEADING
     onward = np.zeros(3)
-    x, cov = _last_and_beacons(placement)
+    x = np.concatenate([placement.poses[placement.drawn], placement.beacons.ravel()])
+    columns = placement.columns(placement.drawn)
+    cov = placement.cov[np.ix_(columns, columns)]
     J = numeric_jacobian(partial(published, slots=placement.slots, frame_slots=frame_slots, onward=onward), x)
     cov = J @ cov @ J.T
     if np.sqrt(cov[2, 2]) > heading_enough or largest_sigma(cov[:2, :2])[0] > sigma_enough:

@@ -6,18 +6,20 @@ track between two keyframes is not to be trusted and a range belongs to a place 
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from uwbslam_jax.estimator import Estimate
-from uwbslam_jax.measurements import Snapshot, StampedFrame
+from uwbslam_jax.measurements import Odometry, Snapshot, StampedFrame
 from uwbslam_jax.numerics import (
     TrackRanges,
+    compose,
     mean_sigma,
     median_range,
     near_middle,
@@ -55,6 +57,11 @@ def is_far(pose: np.ndarray, last: np.ndarray, elapsed: int, blind: Callable[[],
     return moved or (elapsed > _BLIND_S * 1e9 and blind())
 
 
+def rolled_on(wheels: np.ndarray, odometry: Odometry) -> np.ndarray:
+    """(3,) motion by wheels (3,) with one more increment; NaN from the first on that is missing [m, m, rad]."""
+    return compose(wheels, np.asarray(odometry.increment, float)) if bool(odometry.valid) else np.full(3, np.nan)
+
+
 @dataclass(frozen=True)
 class Keyframe:
     """One pose of the start-up track.
@@ -64,7 +71,8 @@ class Keyframe:
       pose: (3,) in the start frame [m, m, rad].
       information: (3, 3) of its match, in the start frame; 0 where LiDAR said nothing.
       velocity, yaw_rate: of the robot then, to undo the sweep [m/s, rad/s].
-      odometry: whether wheels measured the whole way from the keyframe before.
+      matched: whether a scan tells where it is in the map, or began the map.
+      wheels: (3,) motion since the keyframe before by odometry, NaN where it was not measured all the way [m, m, rad].
     """
 
     frame: StampedFrame
@@ -72,7 +80,8 @@ class Keyframe:
     information: np.ndarray
     velocity: np.ndarray
     yaw_rate: float
-    odometry: bool = False
+    matched: bool = True
+    wheels: np.ndarray = field(default_factory=lambda: np.full(3, np.nan))
 
     def snapshot(self) -> Snapshot:
         """Its scan and how the robot moved."""
@@ -80,9 +89,14 @@ class Keyframe:
         return Snapshot(self.frame.frame.scan, drift, np.float32(self.yaw_rate))
 
     @property
+    def rolled(self) -> bool:
+        """Whether wheels measured the whole way from the keyframe before."""
+        return bool(np.isfinite(self.wheels[0]))
+
+    @property
     def blind(self) -> bool:
         """Whether nothing told how far the robot moved in some direction."""
-        return not self.odometry and bool(is_blind(self.information))
+        return not self.rolled and bool(is_blind(self.information))
 
 
 class Sighting(NamedTuple):
@@ -107,7 +121,7 @@ class Buffer:
         self.pairs: dict[tuple[int, int], deque[float]] = {}
         self.host = host
         self._latest: Keyframe | None = None
-        self._odometry = True
+        self._wheels = np.zeros(3)
 
     @property
     def extent(self) -> float:
@@ -130,27 +144,42 @@ class Buffer:
     def add(self, frame: StampedFrame, estimate: Estimate) -> None:
         """Take in one frame with the pose that LiDAR (and odometry) gave it."""
         pose = np.asarray(estimate.pose, float)
-        measured = bool(frame.frame.odometry.valid)
-        self._odometry = self._odometry and measured
-        if (bool(frame.frame.has_scan) and not estimate.poor) or measured or not self.keyframes:
+        matched = bool(frame.frame.has_scan) and not bool(estimate.poor)
+        self._wheels = rolled_on(self._wheels, frame.frame.odometry)
+        if matched or bool(frame.frame.odometry.valid) or not self.keyframes:
             self._latest = Keyframe(
                 frame,
                 pose,
                 np.asarray(estimate.information, float),
                 np.asarray(estimate.velocity, float),
                 float(estimate.yaw_rate),
-                self._odometry,
+                matched,
+                self._wheels,
             )
-            if not self.keyframes or self._far_from_last(self._latest):
-                self.keyframes.append(self._latest)
-                self._odometry = True
-                if len(self.keyframes) > _MOST_KEYFRAMES:
-                    self._thin()
+            self._keep(self._latest)
         for k in np.flatnonzero(self.host.usable(frame.frame.ranges)):
             self._add_range(frame, int(k), pose, np.asarray(estimate.velocity, float), float(estimate.yaw_rate))
 
-    def _far_from_last(self, key: Keyframe) -> bool:
-        last = self.keyframes[-1]
+    def _keep(self, key: Keyframe) -> None:
+        """A keyframe far from the last one; a scan far from the last scan as well, in place of one by wheels alone that
+        is near: what it tells holds the whole way from that scan, and wheels tell little of a heading."""
+        if not self.keyframes or self._is_far(key, self.keyframes[-1]):
+            self.keyframes.append(key)
+        elif key.matched and not self.keyframes[-1].matched and len(self.keyframes) > 1 and self._is_news(key):
+            self.keyframes[-1] = replace(key, wheels=compose(self.keyframes[-1].wheels, key.wheels))
+        else:
+            return
+        self._wheels = np.zeros(3)
+        if len(self.keyframes) > _MOST_KEYFRAMES:
+            self._thin()
+
+    def _is_news(self, key: Keyframe) -> bool:
+        """Whether a scan was not taken near the last one that was kept."""
+        scans = (other for other in reversed(self.keyframes) if other.matched)
+        return all(self._is_far(key, other) for other in itertools.islice(scans, 1))
+
+    @staticmethod
+    def _is_far(key: Keyframe, last: Keyframe) -> bool:
         return is_far(key.pose, last.pose, key.frame.stamp - last.frame.stamp, lambda: key.blind)
 
     def _add_range(self, frame: StampedFrame, k: int, pose: np.ndarray, velocity: np.ndarray, yaw_rate: float) -> None:
@@ -168,12 +197,18 @@ class Buffer:
             self.sightings[j] = deque(list(kept)[::2])
 
     def _thin(self) -> None:
-        # a step is long enough to be measured by wheels only if both of its halves were
-        kept = [self.keyframes[0]]
+        """Of each two keyframes one is left, with a scan where one has; what wheels measured adds up."""
+        kept, wheels = [self.keyframes[0]], np.zeros(3)
         for first, second in zip(self.keyframes[1::2], self.keyframes[2::2], strict=False):
-            kept.append(replace(second, odometry=first.odometry and second.odometry))
-        if kept[-1].frame.stamp < self.newest:
-            kept.append(self.keyframes[-1])
+            if first.matched and not second.matched:
+                kept.append(replace(first, wheels=compose(wheels, first.wheels)))
+                wheels = second.wheels
+            else:
+                kept.append(replace(second, wheels=compose(compose(wheels, first.wheels), second.wheels)))
+                wheels = np.zeros(3)
+        if len(self.keyframes) % 2 == 0:
+            last = self.keyframes[-1]
+            kept.append(replace(last, wheels=compose(wheels, last.wheels)))
         self.keyframes = kept
 
     def averages(self, keys: list[Keyframe]) -> list[TrackRanges]:

@@ -55,6 +55,7 @@ class Placement:
       poses: (N, 3); slots: placed beacons; beacons: (B, 2) [m]; cost: negative log-likelihood.
       cov: joint covariance of poses and beacons in that order (3 N + 2 B).
       bias, bias_sigma: (1 + B,) of the robot's node and the beacons' [m].
+      drawn: number of the last pose whose scan is in the map, of the last one where there is no scan.
     """
 
     poses: np.ndarray
@@ -64,6 +65,7 @@ class Placement:
     cov: np.ndarray
     bias: np.ndarray
     bias_sigma: np.ndarray
+    drawn: int
 
     def beacon_sigma(self) -> np.ndarray:
         """(B,) largest standard deviation of each beacon's position in the start frame [m]."""
@@ -77,8 +79,13 @@ class Placement:
         cov = self.cov[np.ix_(columns, columns)]
         slots = [self.slots[b] for b in kept]
         return Placement(
-            self.poses, slots, self.beacons[kept], self.cost, cov, self.bias[nodes], self.bias_sigma[nodes]
+            self.poses, slots, self.beacons[kept], self.cost, cov, self.bias[nodes], self.bias_sigma[nodes], self.drawn
         )
+
+    def columns(self, *poses: int) -> np.ndarray:
+        """Of some poses, given by their number, and of the beacons in the covariance."""
+        n = self.poses.size
+        return np.concatenate([*(3 * k + np.arange(3) for k in poses), np.arange(n, n + self.beacons.size)])
 
     def apart(self, other: Placement) -> np.ndarray:
         """(B,) how far the beacons of another explanation are from these [m]."""
@@ -90,11 +97,12 @@ class Problem(PoseGraph):
     """The batch problem in arrays.
 
     Attributes:
-      slots: (B,) of the beacons. track: (N, 3) the keyframes as the track has them [m, m, rad].
+      slots: (B,) of the beacons. track: (N, 3) the keyframes as the track has them [m, m, rad]. drawn: see Placement.
     """
 
     slots: list[int]
     track: np.ndarray
+    drawn: int
 
     @staticmethod
     def build(buffer: Buffer) -> Problem | None:
@@ -119,6 +127,7 @@ class Problem(PoseGraph):
             pairs=Pairs.of(pairs),
             slots=list(index),
             track=np.array([key.pose for key in keys]),
+            drawn=max((k for k, key in enumerate(keys) if key.matched), default=len(keys) - 1),
         )
 
     def images(self, placement: Placement) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -150,7 +159,8 @@ class Problem(PoseGraph):
         cov = covariance(self.rows(x[:3], bias_sigma, _STAGES[-1]), x, self.rank, np.arange(len(x)))
         poses, beacons, bias = self.split(x)
         m = self.first_bias
-        return Placement(poses, self.slots, beacons, cost, cov[:m, :m], bias, np.sqrt(np.diag(cov)[m:]))
+        sigma = np.sqrt(np.diag(cov)[m:])
+        return Placement(poses, self.slots, beacons, cost, cov[:m, :m], bias, sigma, self.drawn)
 
     def keep_unique(self, best: Placement, bias_sigma: float = CALIBRATED_M) -> Placement:
         """The placement without the beacons that have a second place which explains the ranges as well."""
@@ -171,18 +181,25 @@ class Problem(PoseGraph):
 
 
 def _steps(keys: list[Keyframe]) -> Edges:
-    """Relative poses of consecutive keyframes, with the roots of their information in the earlier one's frame."""
-    new, poses = np.arange(1, len(keys)), np.array([key.pose for key in keys])
-    steps = between(poses[:-1], poses[1:])
-    elapsed = np.diff([key.frame.stamp for key in keys]) / 1e9
+    """Relative poses of consecutive keyframes, then of each scan that follows on keyframes by wheels alone to the scan
+    before them: what its match tells holds the whole way from there."""
+    matched, poses = np.array([key.matched for key in keys]), np.array([key.pose for key in keys])
+    stamps = np.array([key.frame.stamp for key in keys])
+    scans, next_one = np.flatnonzero(matched), np.arange(1, len(keys))
+    apart = np.flatnonzero(np.diff(scans) > 1)
+    old, new = np.append(next_one - 1, scans[apart]), np.append(next_one, scans[apart + 1])
+    told = matched[old] & matched[new]
+    rolled = np.array([key.rolled for key in keys])[new] & (new == old + 1)
+    by_wheels = (rolled & ~told)[:, None]
+    steps = np.where(by_wheels, np.array([key.wheels for key in keys])[new], between(poses[old], poses[new]))
     # where the match says nothing, wheels or the motion model still bound the step; where it says much, the map it was
     # matched with has its own drift
-    loose = loose_sigma(steps, elapsed, np.array([key.odometry for key in keys[1:]]))
-    turn = np.array([rotation_matrix(-pose[2], 3) for pose in poses[:-1]])
-    told = turn @ np.array([key.information for key in keys[1:]]) @ turn.swapaxes(1, 2)
-    cov = np.linalg.inv(told + diagonal(loose**-2)) + diagonal(step_sigma(steps, _DRIFT) ** 2)
-    roots = np.linalg.cholesky(np.linalg.inv(cov)).swapaxes(1, 2)
-    return Edges(new - 1, new, steps, roots, np.zeros(len(new), bool))
+    loose = loose_sigma(steps, (stamps[new] - stamps[old]) / 1e9, rolled)
+    turn = np.array([rotation_matrix(-heading, 3) for heading in poses[old, 2]]).reshape(-1, 3, 3)
+    information = np.array([key.information for key in keys])[new] * told[:, None, None]
+    cov = np.linalg.inv(turn @ information @ turn.swapaxes(1, 2) + diagonal(loose**-2))
+    roots = np.linalg.cholesky(np.linalg.inv(cov + diagonal(step_sigma(steps, _DRIFT) ** 2))).swapaxes(1, 2)
+    return Edges(old, new, steps, roots, np.zeros(len(new), bool))
 
 
 def loose_sigma(steps: np.ndarray, elapsed: np.ndarray, rolled: np.ndarray) -> np.ndarray:
