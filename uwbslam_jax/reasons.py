@@ -1,4 +1,5 @@
-"""Why measurements are left out: what files and pages call it, of which sensor, and what a user can do about it."""
+"""Why measurements are left out, and what start-up waits for: what files and pages call it, of which sensor, and what a
+user can do about it."""
 
 from __future__ import annotations
 
@@ -130,3 +131,46 @@ class OdometryLost:
     TWICE = Reason(Sensor.ODOMETRY, _TWICE, _MERGED, told=True)
     STAMP = Reason(Sensor.ODOMETRY, "stamp not after the one before", _CLOCK)
     MALFORMED = Reason(Sensor.ODOMETRY, "malformed", _BYTES)
+
+
+class Lack(str):
+    """What start-up does not know yet; equal to any text that says the same.
+
+    Attributes:
+      advice: what helps.
+    """
+
+    advice: str
+
+    def __new__(cls, words: str, advice: str) -> Lack:
+        made = super().__new__(cls, words)
+        made.advice = advice
+        return made
+
+    def __getnewargs__(self) -> tuple[str, str]:
+        return str(self), self.advice
+
+
+class StartUpLacks:
+    """Of start-up, in the order in which it asks."""
+
+    MOTION = Lack("by its scans and odometry the robot has moved less than a metre", "drive on")
+    RANGES = Lack(
+        "fewer than two beacons were ranged along the way",
+        "are the beacons on, and is --robot.id the robot's own? the robot's ranges are the ones that count",
+    )
+    FIT = Lack(
+        "the ranges do not fit the track",
+        "is --robot.id the robot's own? are ranges and odometry in m, and stamped by one clock? --no-odom leaves "
+        "odometry out",
+    )
+    SIDE = Lack("the ranges fit a mirrored place as well", "drive on, and turn both ways")
+    BEACONS = Lack(
+        "of no two beacons the ranges tell one place",
+        "drive on, not in a straight line and nearer to the beacons; more of them, or ranges between them, help",
+    )
+    HEADING = Lack(
+        "it is not certain how robot and map are turned among the beacons",
+        "drive on; scans and wheels that measure turns better, and ranges on both sides, help",
+    )
+    MORE = Lack("not every beacon is certain yet, and without a map those placed together are placed best", "drive on")

@@ -48,6 +48,7 @@ class EventKind(Enum):
     """What happened in a run; the value is its sentence, {} stands for an event's detail."""
 
     STATUS = "{}"
+    WAITS = "start-up waits: {}"
     FRAME_DECIDED = "frame decided by beacons {}"
     CORRECTED = "beacons and map corrected by the run so far"
     BIASED = "ranges are biased: biases and beacons solved from the run so far"

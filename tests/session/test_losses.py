@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from uwbslam_jax.measurements import RangeMessage, ScanMessage
-from uwbslam_jax.reasons import OdometryLost, RangeLost, ScanLost, Sensor
-from uwbslam_jax.result import RunStatus
+from uwbslam_jax.reasons import OdometryLost, RangeLost, ScanLost, Sensor, StartUpLacks
 from uwbslam_jax.session.frame_assembler import FrameAssembler
 from uwbslam_jax.session.losses import blank_scans, losses, unplaced
 from uwbslam_jax.session.result_builder import Facts, to_result
@@ -78,14 +77,14 @@ def test_scans_without_a_return_are_told_where_they_are_most() -> None:
 
 def test_what_is_not_placed_has_its_own_cause() -> None:
     told = [
-        unplaced(RunStatus.WAITING, 7, ranges=0, seen=True),
-        unplaced(RunStatus.WAITING, 7, ranges=9, seen=False),
-        unplaced(RunStatus.WAITING, 7, ranges=9, seen=True),
-        unplaced(RunStatus.PLACING, 7, ranges=9, seen=True),
-        unplaced(RunStatus.UNDECIDED, 7, ranges=9, seen=True),
+        unplaced(StartUpLacks.MOTION, ranges=0, seen=True),
+        unplaced(StartUpLacks.MOTION, ranges=9, seen=False),
+        unplaced(StartUpLacks.MOTION, ranges=9, seen=True),
+        unplaced(StartUpLacks.RANGES, ranges=9, seen=True),
+        unplaced(StartUpLacks.SIDE, ranges=9, seen=True),
     ]
     assert ["moved" in line for line in told] == [False, False, True, False, False]
-    assert "--robot.id 7" in told[3]
+    assert "--robot.id" in told[3]
     assert len(set(told)) == 5
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from uwbslam_jax.reasons import Reason, Sensor
-from uwbslam_jax.result import RunStatus
+from uwbslam_jax.reasons import Lack, Reason, Sensor
 
 MANY = 0.2
 """Losing a larger share of a sensor is told [0 to 1]: a tenth is a slow computer, a fifth is a fault."""
@@ -48,11 +47,11 @@ def blank_scans(scans: int, blank: int) -> list[str]:
     return [f"{blank} of {scans} scans hold no return within the limits: {helps}"]
 
 
-def unplaced(status: RunStatus, robot: int, *, ranges: int, seen: bool) -> str:
-    """The line of a run that heard beacons, or should have, and placed none.
+def unplaced(lack: Lack, *, ranges: int, seen: bool) -> str:
+    """The line of a run that heard beacons, or should have, and has placed none.
 
     Args:
-      status: of start-up at the end. robot: id of the robot's node.
+      lack: what start-up waits for.
       ranges: how many went into frames.
       seen: whether scans that fitted, or odometry, showed how the robot moved.
     """
@@ -60,11 +59,4 @@ def unplaced(status: RunStatus, robot: int, *, ranges: int, seen: bool) -> str:
         return "no range was heard: no beacon is placed; is the radio on, and does --uwb.topic name its ranges?"
     if not seen:
         return "no beacon is placed: neither scans nor odometry show how the robot moves"
-    if status is RunStatus.WAITING:
-        return "no beacon is placed: by its scans and odometry the robot has moved less than a metre; drive on"
-    if status is RunStatus.UNDECIDED:
-        return "no beacon is placed: the ranges fit a mirrored place as well; drive on, and turn both ways"
-    return (
-        f"no beacon is placed: too few ranges with the robot's node (--robot.id {robot}), too straight a way, "
-        "or ranges that do not fit the track"
-    )
+    return f"no beacon is placed: {lack}; {lack.advice}"

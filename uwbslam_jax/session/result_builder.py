@@ -123,12 +123,12 @@ def _tracks(history: History, ids: dict[int, int], start: int) -> dict[int, np.n
     return tracks
 
 
-def _seen(session: Session, facts: Facts) -> bool:
+def seen(session: Session, *, odometry_used: bool) -> bool:
     """Whether odometry, or scans of which most fit the map, showed how the robot moves."""
     history = session.history
     scans, told = history.has_scan.values, history.diagnostics
     fits = scans & (told["match_score"] > 0) & (told["poor_match"] == 0) if len(scans) else scans
-    return facts.odometry_used or bool(2 * fits.sum() > scans.sum() > 0)
+    return odometry_used or bool(2 * fits.sum() > scans.sum() > 0)
 
 
 def _unplaced(session: Session, facts: Facts) -> list[str]:
@@ -137,8 +137,7 @@ def _unplaced(session: Session, facts: Facts) -> list[str]:
     lost = any(isinstance(why, Reason) and why.sensor is Sensor.RANGE for why in +facts.dropped)
     if session.settings.filter.lidar_only or (lost and not used):
         return []
-    robot, seen = session.settings.robot.id, _seen(session, facts)
-    return [unplaced(session.status, robot, ranges=used, seen=seen)]
+    return [unplaced(session.lack, ranges=used, seen=seen(session, odometry_used=facts.odometry_used))]
 
 
 def _biases(session: Session) -> list[str]:
@@ -244,7 +243,8 @@ def _summary(session: Session, facts: Facts) -> dict[str, Any]:
     total = {name: int(np.sum(values)) for name, values in history.diagnostics.items()}
     rejected = {"not in line of sight": total.get("ranges_nlos", 0), "doubted": total.get("ranges_doubted", 0)}
     used = total.get("ranges_used", 0)
-    unseen = session.status is RunStatus.WAITING and facts.relative is None and not _seen(session, facts)
+    unseen = session.status is RunStatus.WAITING and facts.relative is None
+    unseen = unseen and not seen(session, odometry_used=facts.odometry_used)
     rejected["node not placed"] = total.get("ranges", 0) - used - sum(rejected.values())
     return {
         "steps": len(stamps),

@@ -18,9 +18,9 @@ from uwbslam_jax.numerics import Column
 from uwbslam_jax.reasons import Sensor
 from uwbslam_jax.result import Result, RunStatus
 from uwbslam_jax.session.frame_assembler import FrameAssembler
-from uwbslam_jax.session.losses import losses
+from uwbslam_jax.session.losses import losses, unplaced
 from uwbslam_jax.session.message_clocks import MessageClocks
-from uwbslam_jax.session.result_builder import Facts, to_result
+from uwbslam_jax.session.result_builder import Facts, seen, to_result
 from uwbslam_jax.session.saved_state import Locator, Saved
 from uwbslam_jax.session.session import CONTROL_EVERY, Session
 from uwbslam_jax.session.update import Update
@@ -132,8 +132,14 @@ class Runner:
 
     def warnings(self, dropped: Counter[str], least: int = 1) -> dict[Sensor | str, str]:
         """What a user should know by now, one line each, by what it is about. dropped, least: see losses."""
+        used = self._assembler.used
         told: dict[Sensor | str, str] = {text: text for text in self._assembler.warnings}
-        return told | losses(self._assembler.used, dropped + self._assembler.dropped, least)
+        told |= losses(used, dropped + self._assembler.dropped, least)
+        # at rest the status says all there is to say
+        if self.session.overdue and self.session.status is not RunStatus.WAITING and Sensor.RANGE not in told:
+            moves = seen(self.session, odometry_used=self._assembler.odometry_used)
+            told["start-up"] = unplaced(self.session.lack, ranges=used[Sensor.RANGE], seen=moves)
+        return told
 
     def relative(self) -> Relative | None:
         """Geometry of the nodes among themselves while the robot rests; None where the ranges do not fix one, or show

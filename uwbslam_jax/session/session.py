@@ -18,6 +18,7 @@ from uwbslam_jax.beacons import MEMORY_S, BeaconKeeper
 from uwbslam_jax.estimator import Changes, Estimate, HostView, compiled, init, widened
 from uwbslam_jax.mapping import Tiles
 from uwbslam_jax.measurements import Odometry, StampedFrame
+from uwbslam_jax.reasons import Lack
 from uwbslam_jax.result import BeaconStatus, EventKind, MapImage, RunStatus
 from uwbslam_jax.session import saved_state
 from uwbslam_jax.session.history import History
@@ -103,6 +104,16 @@ class Session:
     def biased(self) -> bool:
         """Whether a bias was found that is worth reporting."""
         return notable(self.found_bias, self.settings.uwb.sigma_n)
+
+    @property
+    def lack(self) -> Lack:
+        """What start-up waits for, or waited for last."""
+        return self._start_up.lack
+
+    @property
+    def overdue(self) -> bool:
+        """Whether start-up has been waiting for long, and still is."""
+        return self._start_up.overdue and self.decided_at is None
 
     def beacon_status(self, slot: int) -> BeaconStatus:
         """Of a beacon now; never RELATIVE."""

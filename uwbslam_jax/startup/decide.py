@@ -14,6 +14,7 @@ import numpy as np
 
 from uwbslam_jax.estimator import published
 from uwbslam_jax.numerics import CALIBRATED_M, DECIDED, SIGMA_ENOUGH_M, largest_sigma, numeric_jacobian
+from uwbslam_jax.reasons import Lack, StartUpLacks
 from uwbslam_jax.result import RunStatus
 from uwbslam_jax.startup.hypotheses import explanations
 from uwbslam_jax.startup.keyframe_buffer import Buffer
@@ -27,6 +28,8 @@ _HEADING_ENOUGH = 0.026
 """Start-up ends when the robot's heading among the beacons is known this well [rad]."""
 _UNDRAWN_HEADING, _UNDRAWN_SIGMA = 0.15, 0.05
 """The same without a map [rad], and for positions as a share of the distance between beacons."""
+_MISFIT = 3.0
+"""Ranges of which half are off by more standard deviations than this do not fit the track."""
 _UNDRAWN_WAIT_S = 60.0
 """Without a map so long is waited for beacons that are not yet certain: placed together they are placed best."""
 
@@ -40,6 +43,7 @@ class Outcome:
       hypotheses: how many explanations are alive (0 before there is one).
       margin: difference of log-likelihood between the two reflections.
       placement: the decided one, else None.
+      lack: what is waited for, None where there is a placement.
       biased: whether the ranges are explained far better with a bias of each node; a placement
         then has them.
     """
@@ -48,28 +52,32 @@ class Outcome:
     hypotheses: int
     margin: float
     placement: Placement | None
+    lack: Lack | None = None
     biased: bool = False
 
 
 def solve(buffer: Buffer, ids: dict[int, int]) -> Outcome:
     """Place the beacons if what is buffered determines them. ids: slot -> node id."""
     if buffer.extent < _MOVED_ENOUGH_M and not any(key.blind for key in buffer.keyframes[1:]):
-        return Outcome(RunStatus.WAITING, 0, 0.0, None)
+        return Outcome(RunStatus.WAITING, 0, 0.0, None, StartUpLacks.MOTION)
     problem = Problem.build(buffer)
     if problem is None:
-        return Outcome(RunStatus.PLACING, 0, 0.0, None)
+        return Outcome(RunStatus.PLACING, 0, 0.0, None, StartUpLacks.RANGES)
     found, bias_sigma = _explain(problem)
     best, biased = found[0], bias_sigma > CALIBRATED_M
     margin = found[1].cost - best.cost if len(found) > 1 else float("inf")
+    misfit = StartUpLacks.FIT if problem.misfit(best) > _MISFIT else None
     if margin < DECIDED:
         alive = sum(other.cost - best.cost < DECIDED for other in found)
-        return Outcome(RunStatus.UNDECIDED, alive, margin, None, biased)
+        return Outcome(RunStatus.UNDECIDED, alive, margin, None, misfit or StartUpLacks.SIDE, biased)
     drawn = any(key.information.any() for key in buffer.keyframes)
     sure = _keep_certain(problem.keep_unique(best, bias_sigma), ids, drawn=drawn)
     waits = not drawn and buffer.newest - buffer.keyframes[0].frame.stamp < _UNDRAWN_WAIT_S * 1e9
-    if sure is None or (waits and len(sure.slots) < len(problem.slots)):
-        return Outcome(RunStatus.PLACING, 1, margin, None, biased)
-    return Outcome(RunStatus.DECIDED, 1, margin, sure, biased)
+    if isinstance(sure, Placement) and waits and len(sure.slots) < len(problem.slots):
+        sure = StartUpLacks.MORE
+    if isinstance(sure, Lack):
+        return Outcome(RunStatus.PLACING, 1, margin, None, misfit or sure, biased)
+    return Outcome(RunStatus.DECIDED, 1, margin, sure, None, biased)
 
 
 def _explain(problem: Problem) -> tuple[list[Placement], float]:
@@ -82,8 +90,8 @@ def _explain(problem: Problem) -> tuple[list[Placement], float]:
     return explanations(problem, _BIAS_M), _BIAS_M
 
 
-def _keep_certain(placement: Placement, ids: dict[int, int], *, drawn: bool) -> Placement | None:
-    """The beacons whose place in the published frame is certain, None where the robot's own is not.
+def _keep_certain(placement: Placement, ids: dict[int, int], *, drawn: bool) -> Placement | Lack:
+    """The beacons whose place in the published frame is certain, or what is not known yet.
 
     The start frame is no measure: all beacons turn together with the heading that the track started with. What the
     robot drove by wheels since its last scan is no matter: the map hangs on that scan, and the next one tells. Where
@@ -91,7 +99,7 @@ def _keep_certain(placement: Placement, ids: dict[int, int], *, drawn: bool) -> 
     linear.
     """
     if len(placement.slots) < 2:
-        return None
+        return StartUpLacks.BEACONS
     frame_slots = choose_frame(placement, ids)
     sigma_enough, heading_enough = SIGMA_ENOUGH_M, _HEADING_ENOUGH
     if not drawn:
@@ -104,9 +112,9 @@ def _keep_certain(placement: Placement, ids: dict[int, int], *, drawn: bool) -> 
     J = numeric_jacobian(partial(published, slots=placement.slots, frame_slots=frame_slots, onward=onward), x)
     cov = J @ cov @ J.T
     if np.sqrt(cov[2, 2]) > heading_enough or largest_sigma(cov[:2, :2])[0] > sigma_enough:
-        return None
+        return StartUpLacks.HEADING
     certain = largest_sigma(cov[3:, 3:]) < sigma_enough
-    return placement.only([b for b, ok in enumerate(certain) if ok]) if sum(certain) >= 2 else None
+    return placement.only([b for b, ok in enumerate(certain) if ok]) if sum(certain) >= 2 else StartUpLacks.BEACONS
 
 
 def choose_frame(placement: Placement, ids: dict[int, int]) -> tuple[int, int]:

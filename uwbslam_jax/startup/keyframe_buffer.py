@@ -113,6 +113,7 @@ class Buffer:
     Attributes:
       keyframes: kept so far. sightings: slot -> ranges of the robot to it; pairs: (i, j) -> ranges between beacons.
       host: what a range is taken for; grows as ids get slots.
+      taken: keyframes so far, those that were thinned out since as well.
     """
 
     def __init__(self, host: HostParams):
@@ -120,6 +121,7 @@ class Buffer:
         self.sightings: dict[int, deque[Sighting]] = {}
         self.pairs: dict[tuple[int, int], deque[float]] = {}
         self.host = host
+        self.taken = 0
         self._latest: Keyframe | None = None
         self._wheels = np.zeros(3)
 
@@ -169,6 +171,7 @@ class Buffer:
             self.keyframes[-1] = replace(key, wheels=compose(self.keyframes[-1].wheels, key.wheels))
         else:
             return
+        self.taken += 1
         self._wheels = np.zeros(3)
         if len(self.keyframes) > _MOST_KEYFRAMES:
             self._thin()

@@ -162,6 +162,12 @@ class Problem(PoseGraph):
         sigma = np.sqrt(np.diag(cov)[m:])
         return Placement(poses, self.slots, beacons, cost, cov[:m, :m], bias, sigma, self.drawn)
 
+    def misfit(self, placement: Placement) -> float:
+        """Median of how far the robot's ranges are off in a placement, in standard deviations."""
+        apart = np.linalg.norm(self.ranges.antenna(placement.poses) - placement.beacons[self.ranges.to], axis=1)
+        bias = placement.bias[0] + placement.bias[1 + self.ranges.to]
+        return float(np.median(np.abs(apart + bias - self.ranges.distance) / self.ranges.sigma))
+
     def keep_unique(self, best: Placement, bias_sigma: float = CALIBRATED_M) -> Placement:
         """The placement without the beacons that have a second place which explains the ranges as well."""
         antenna, sigma = self.ranges.antenna(best.poses), best.beacon_sigma()

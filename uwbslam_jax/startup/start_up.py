@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from uwbslam_jax.estimator import Changes, HostView, SlotEvent
+from uwbslam_jax.reasons import Lack, StartUpLacks
 from uwbslam_jax.result import EventKind, RunStatus
 from uwbslam_jax.settings import HostParams
 from uwbslam_jax.startup.adopt import adopt
@@ -11,13 +12,25 @@ from uwbslam_jax.startup.keyframe_buffer import Buffer
 
 _SOLVE_EVERY_S = 1.0
 """The problem is solved at most this often, in the log's time: it costs more than a second's steps [s]."""
+_GROWTH = 1.05
+"""And not before there are so many times the keyframes that the last one was solved with: what a long start could not
+tell, a metre more does not. So its cost a second falls with the way, and a decision is late by a twentieth of it."""
+_OVERDUE_S = 60.0
+"""After so long it is told what start-up waits for [s]."""
 
 
 class StartUp:
-    """Start-up in progress."""
+    """Start-up in progress.
+
+    Attributes:
+      lack: what it waits for. overdue: whether it has been waiting for long.
+    """
 
     def __init__(self, host: HostParams):
+        self.lack: Lack = StartUpLacks.MOTION
+        self.overdue = False
         self._buffer = Buffer(host)
+        self._began: int | None = None
         self._solved_at = self._solved_with = 0
         self._status = RunStatus.WAITING
 
@@ -26,11 +39,25 @@ class StartUp:
         self._buffer.host = view.host  # ids that were just heard have heights and biases of their own
         for frame, estimate in view.seen:
             self._buffer.add(frame, estimate)
-        now, ids = view.now, view.ids
-        if now - self._solved_at < _SOLVE_EVERY_S * 1e9 or self._buffer.newest == self._solved_with:
-            return Changes()  # nothing can have been learnt but better averages
-        self._solved_at, self._solved_with = now, self._buffer.newest
-        outcome = solve(self._buffer, ids)
+        self._began = view.seen[0][0].stamp if self._began is None else self._began
+        changes = self._solve(view) if self._is_due(view.now) else Changes()
+        if self.overdue or changes.state is not None or view.now - self._began < _OVERDUE_S * 1e9:
+            return changes
+        self.overdue = True
+        return changes._replace(events=[*changes.events, SlotEvent(0, EventKind.WAITS, self.lack)])
+
+    def _is_due(self, now: int) -> bool:
+        """Whether more can have been learnt than better averages."""
+        return now - self._solved_at >= _SOLVE_EVERY_S * 1e9 and (
+            self._buffer.taken >= max(_GROWTH * self._solved_with, self._solved_with + 1)
+        )
+
+    def _solve(self, view: HostView) -> Changes:
+        ids, outcome = view.ids, solve(self._buffer, view.ids)
+        self._solved_at = view.now
+        if outcome.status is not RunStatus.WAITING:  # which costs nothing
+            self._solved_with = self._buffer.taken
+        self.lack = outcome.lack or self.lack
         events = [SlotEvent(0, EventKind.STATUS, outcome.status)] if outcome.status != self._status else []
         self._status = outcome.status
         known = Changes(status=outcome.status, hypotheses=outcome.hypotheses, events=events)
