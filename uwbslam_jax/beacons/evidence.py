@@ -7,7 +7,7 @@ where the other node is a beacon, its place is looked up when it is needed, beca
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +30,13 @@ MEMORY_S = 40.0
 """Rows are kept this long."""
 _WINDOWS_S = (40.0, 20.0, 10.0, 5.0, 2.0)
 """A node that may have come to rest a while ago is looked for over these last times, the longest first."""
+_LONG_S = 600.0
+"""And over so long before, where it has been ranged for longer and is not placed yet: one that is heard seldom, or only
+when the robot passes by, tells where it is over several passes [s]."""
+_LONG_STEP_M, _LONG_MOST = 0.3, 100
+"""Of what is older than `MEMORY_S` one range is kept in so much of the way [m], and so many of them."""
+_HELD_M = 20.0
+"""Farther back the track is held by the beacons, and errs by no more than over so much of the way: 0.1 m."""
 _GROUP_S = 0.5
 """Ranges to one node within this time are averaged."""
 _HEADING_WALK = 0.002
@@ -57,26 +64,55 @@ _SUPPORTS = 0.5
 
 
 class Sightings:
-    """Rows of one node, in order of time."""
+    """Rows of one node, in order of time.
+
+    Attributes:
+      count: rows ever added.
+    """
 
     def __init__(self) -> None:
+        self.count = 0
         self._chunks: list[np.ndarray] = []
+        self._older = np.zeros((0, 6))  # some of those before the chunks
 
     def add(self, rows: np.ndarray) -> None:
         """Newer rows (R, 6)."""
         self._chunks.append(rows)
+        self.count += len(rows)
+
+    @property
+    def reach_back(self) -> bool:
+        """Whether there are rows of long ago."""
+        return len(self._older) > 0
 
     def since(self, time: float) -> np.ndarray:
         """Rows (R, 6) from a time on [s]."""
-        rows = np.concatenate([np.zeros((0, 6)), *(c for c in self._chunks if c[-1, TIME] >= time)])
+        rows = np.concatenate([self._older, *(c for c in self._chunks if c[-1, TIME] >= time)])
         return rows[rows[:, TIME] >= time]
 
     def forget(self, *, before: float = -np.inf, other: int | None = None) -> None:
         """Drop what is older than a time [s], and all rows to one node."""
-        kept = [c for c in self._chunks if c[-1, TIME] >= before]
+        kept = [self._older[self._older[:, TIME] >= before], *(c for c in self._chunks if c[-1, TIME] >= before)]
         if other is not None:
             kept = [c[c[:, OTHER] != other] for c in kept]
-        self._chunks = [c for c in kept if len(c)]
+        self._older, self._chunks = kept[0], [c for c in kept[1:] if len(c)]
+
+    def condense(self, now: float) -> None:
+        """Of what is older than the memory only some of the robot's ranges are left, spread over its way."""
+        parts = [np.split(c, [np.searchsorted(c[:, TIME], now - MEMORY_S)]) for c in self._chunks]
+        self._chunks = [late for _, late in parts if len(late)]
+        kept = list(self._older)
+        for row in (row for early, _ in parts for row in early if row[OTHER] == 0):
+            if not kept or np.hypot(row[X] - kept[-1][X], row[Y] - kept[-1][Y]) > _LONG_STEP_M:
+                kept.append(row)
+        kept = [row for row in (kept[::2] if len(kept) > _LONG_MOST else kept) if row[TIME] >= now - _LONG_S]
+        self._older = np.array(kept).reshape(-1, 6)
+
+    def carry(self, move: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> None:
+        """The track has moved. move: from times (R,) [s] and places (R, 2) on it to the new places (R, 2) [m]."""
+        for rows in (self._older, *self._chunks):
+            own = rows[:, OTHER] == 0
+            rows[np.ix_(own, [X, Y])] = move(rows[own, TIME], rows[np.ix_(own, [X, Y])])
 
 
 class Known(NamedTuple):
@@ -117,18 +153,21 @@ def anchors(rows: np.ndarray, known: Known) -> np.ndarray:
 
 def resting_place(sightings: Sightings, known: Known) -> tuple[Spot, np.ndarray] | None:
     """Where the node rests and the averaged rows that say so; None where they do not say it, or leave two places."""
-    for window in _WINDOWS_S:
+    windows = (_LONG_S, *_WINDOWS_S) if sightings.reach_back else _WINDOWS_S
+    for window in windows:
         rows = _since(sightings, known, window)
         if len(rows) < _FEWEST_ROWS:
             return None
-        if rows[-1, TIME] - rows[0, TIME] < 0.5 * window and window != _WINDOWS_S[-1]:
+        if rows[-1, TIME] - rows[0, TIME] < 0.5 * window and window not in (_LONG_S, _WINDOWS_S[-1]):
             continue  # no more than a shorter window has
         # two beacons at rest have one distance, however often it is measured
         groups, sigma = _averaged(rows, known, np.where(rows[:, OTHER] == 0, rows[:, TIME] // _GROUP_S, 0.0))
         if len(groups) < _FEWEST_GROUPS:
             continue
         spots = _resting_spots(groups, sigma, known)
-        if _explains(spots[0], groups, known) and _rests(rows, known, spots[0]):
+        newest = rows[rows[:, TIME] >= known.now - MEMORY_S]  # many of long ago must not speak louder than they do
+        agree = window != _LONG_S or not len(newest) or _explains(spots[0], newest, known)
+        if agree and _explains(spots[0], groups, known) and _rests(rows, known, spots[0]):
             # a shorter window would only know less
             return (spots[0], groups) if _certain(spots, known.sigma_n) else None
     return None
@@ -177,13 +216,13 @@ def _common_error(groups: np.ndarray, known: Known) -> np.ndarray:
     """(R, R) covariance of the errors of the groups' anchors, the same in x and y [m^2].
 
     A beacon's is its own. The robot's track, as seen from where it is now, bends like the integral of a heading that
-    drifts at random with the way: cov = q^2 m^2 (3 M - m) / 6 for ways m <= M back from now.
+    drifts at random with the way: cov = q^2 m^2 (3 M - m) / 6 for ways m <= M back from now, at most `_HELD_M`.
     """
     other = groups[:, OTHER]
     common = np.where(other[:, None] == other, known.variance[other.astype(int)], 0.0)
     robot = np.flatnonzero(other == 0)
     steps = np.hypot(*np.diff(groups[robot][:, [X, Y]], axis=0).T)
-    back = np.append(np.cumsum(steps[::-1])[::-1], 0.0)[: len(robot)]
+    back = np.minimum(np.append(np.cumsum(steps[::-1])[::-1], 0.0)[: len(robot)], _HELD_M)
     near, far = np.minimum(back[:, None], back), np.maximum(back[:, None], back)
     common[np.ix_(robot, robot)] = _HEADING_WALK**2 * near**2 * (3 * far - near) / 6
     return common

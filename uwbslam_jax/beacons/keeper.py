@@ -28,7 +28,7 @@ from uwbslam_jax.beacons.evidence import (
     resting_place,
 )
 from uwbslam_jax.beacons.range_table import Heard, heard
-from uwbslam_jax.estimator import Changes, Estimate, HostView, SlotEvent, State, ranging
+from uwbslam_jax.estimator import Changes, Estimate, HostView, Moved, SlotEvent, State, ranging
 from uwbslam_jax.numerics import locate
 from uwbslam_jax.result import BeaconStatus, EventKind
 
@@ -55,19 +55,24 @@ but not from one other place for long."""
 _NEWEST = 4
 """So many of a beacon's newest ranges place a robot that was carried."""
 
+_GROWTH = 1.05
+"""One that is looked for over a long time is looked for again when it was ranged so many times as often."""
 _WATCHED = (BeaconStatus.STATIC, BeaconStatus.MOVING, BeaconStatus.SILENT)
 """Of a beacon that is in the state its ranges are judged."""
+_NOT_PLACED = (BeaconStatus.WAITING, BeaconStatus.DROPPED)
+"""One that is not in the state is looked for."""
 
 
 @dataclass
 class _Life:
     """What the host knows of one slot. heard: when last [s]; doubted: since when its ranges do not fit [s], None where
-    they do; told: whether that was told."""
+    they do; told: whether that was told; tried: with how many rows it was looked for last."""
 
     status: BeaconStatus = BeaconStatus.WAITING
     heard: float = 0.0
     doubted: float | None = None
     told: bool = False
+    tried: int = 0
     sightings: Sightings = field(default_factory=Sightings)
 
 
@@ -105,6 +110,28 @@ class BeaconKeeper:
         life = self._life(slot)
         life.status, life.heard = BeaconStatus.STATIC, self._seconds(stamp)
 
+    def heard_before(self, slot: int, stamps: np.ndarray, antenna: np.ndarray, distance: np.ndarray) -> None:
+        """What start-up has heard of a beacon that it did not place.
+
+        Args:
+          stamps: (R,) in order [ns]. antenna: (R, 2) where the robot's was; distance: (R,) in the plane [m].
+        """
+        time = (stamps - (self._start or 0)) / 1e9
+        life, none = self._life(slot), np.zeros(len(stamps))
+        life.sightings.add(np.column_stack([time, none, antenna, distance, none]))
+        life.heard = float(time[-1])
+
+    def carry(self, moved: Moved) -> None:
+        """The track was solved again: what was heard of beacons that are not placed was heard from there."""
+
+        def move(time: np.ndarray, places: np.ndarray) -> np.ndarray:
+            stamps = (self._start or 0) + np.round(time * 1e9).astype(np.int64)
+            return moved.carry(stamps, np.column_stack([places, np.zeros(len(places))]))[:, :2]
+
+        for life in self._lives.values():
+            if life.status in _NOT_PLACED:
+                life.sightings.carry(move)
+
     def _life(self, slot: int) -> _Life:
         return self._lives.setdefault(slot, _Life())
 
@@ -128,14 +155,17 @@ class BeaconKeeper:
         events: list[SlotEvent] = []
         for slot, life in sorted(self._lives.items()):
             known = self._known(state, sigma_n, now, slot)
-            if life.status in (BeaconStatus.WAITING, BeaconStatus.DROPPED):
+            if life.status in _NOT_PLACED:
                 state = self._try_to_place(state, known, slot, life, events)
             elif life.status is BeaconStatus.MOVING:
                 state = self._follow(state, known, slot, life, events)
             elif share <= _FOUND_SHARE:  # so many at once are not the beacons' fault
                 state = self._watch(state, known, slot, life, span, events)
             trusted = life.status in (BeaconStatus.STATIC, BeaconStatus.SILENT) and life.doubted is None
-            life.sightings.forget(before=now - (_WATCHED_S if trusted else MEMORY_S))
+            if life.status in _NOT_PLACED:
+                life.sightings.condense(now)
+            else:
+                life.sightings.forget(before=now - (_WATCHED_S if trusted else MEMORY_S))
         return Changes(state, events=events)
 
     def _known(self, state: State, sigma_n: float, now: float, slot: int) -> Known:
@@ -175,6 +205,9 @@ class BeaconKeeper:
                     life.sightings.add(rows[mine & usable])
 
     def _try_to_place(self, state: State, known: Known, slot: int, life: _Life, events: list[SlotEvent]) -> State:
+        if life.sightings.reach_back and life.sightings.count < _GROWTH * life.tried:
+            return state
+        life.tried = life.sightings.count
         resting = resting_place(life.sightings, known)
         found = resting or carried_place(life.sightings, known)
         if found is None:

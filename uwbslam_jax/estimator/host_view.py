@@ -90,6 +90,8 @@ class Changes(NamedTuple):
       moved: how what the map was drawn from has moved.
       frame_slots: of the two beacons that make the published frame, once that is decided: the track so far is then
         published anew.
+      heard: slot -> stamps (R,) [ns], places (R, 2) of the antenna and distances (R,) [m] of what was ranged to a
+        beacon that start-up did not place.
       events: in order.
     """
 
@@ -100,4 +102,5 @@ class Changes(NamedTuple):
     hypotheses: int | None = None
     moved: Moved | None = None
     frame_slots: tuple[int, int] | None = None
+    heard: Mapping[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
     events: Sequence[SlotEvent] = ()

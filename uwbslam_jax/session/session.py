@@ -254,6 +254,7 @@ class Session:
             self.status, self.hypotheses = changes.status, changes.hypotheses
         if changes.moved is not None:
             self.history.carry_along(changes.moved, republish=changes.frame_slots is not None)
+            self._keeper.carry(changes.moved)
         ids = self.ids
         for slot, kind, detail in changes.events:
             self.history.event(now, kind, ids[slot] if slot else None, detail)
@@ -262,3 +263,5 @@ class Session:
             self.back_end.publish(changes.frame_slots, changes.moved)
             for slot in np.flatnonzero(np.asarray(self.state.active))[1:]:
                 self._keeper.placed(int(slot), now)
+            for slot, told in changes.heard.items():
+                self._keeper.heard_before(slot, *told)

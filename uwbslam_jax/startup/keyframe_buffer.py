@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uwbslam_jax.estimator import Estimate
+from uwbslam_jax.estimator import Estimate, Moved
 from uwbslam_jax.measurements import Odometry, Snapshot, StampedFrame
 from uwbslam_jax.numerics import (
     TrackRanges,
@@ -245,6 +245,13 @@ class Buffer:
         at, to = groups // 2, np.full(len(groups), slot)
         next_one = np.minimum(at + 1, len(stamps) - 1)
         return TrackRanges(at, next_one, to, share, before, after, distance, 0.0 * distance, sigma)
+
+    def heard(self, slot: int, moved: Moved) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Stamps (R,) [ns], places (R, 2) of the antenna on the moved track and distances (R,) [m] of what was ranged
+        to a beacon."""
+        kept = self.sightings[slot]
+        stamps, poses = np.array([s.stamp for s in kept], np.int64), np.array([s.pose for s in kept])
+        return stamps, transformed(moved.carry(stamps, poses), self.host.antenna), np.array([s.distance for s in kept])
 
     def scatter(self, nodes: int) -> np.ndarray:
         """(K, K) log of how many times sigma_n each pair's latest ranges scatter, at least 0, see ranging."""

@@ -70,4 +70,6 @@ class StartUp:
             bias = dict(zip([0, *outcome.placement.slots], map(float, outcome.placement.bias), strict=True))
         events.append(SlotEvent(0, EventKind.FRAME_DECIDED, " and ".join(str(ids[slot]) for slot in frame_slots)))
         events += [SlotEvent(slot, EventKind.PLACED) for slot in outcome.placement.slots]
+        left_out = self._buffer.sightings.keys() - set(outcome.placement.slots)
+        known = known._replace(heard={slot: self._buffer.heard(slot, moved) for slot in sorted(left_out)})
         return known._replace(state=state, tiles=tiles, bias=bias, moved=moved, frame_slots=frame_slots)
