@@ -124,6 +124,12 @@ ROWS: dict[str, Row] = {
         ),
     ),
     "slow_lidar": Row("1 Hz scans of 361 beams, 3 beacons, robot-only ranges, odometry", 0.10, 0.15),
+    "sparse": Row(
+        "a scan every metre (2.5 s), 181 beams, wheels at 10 Hz",
+        0.03,
+        0.03,
+        checks=(Check("decided after [s]", 60.0, lambda trial, _: trial.decided),),
+    ),
     "lever_arms": Row("lever arms and heights, configured", 0.03, 0.03),
     "biased": Row(
         "antenna delays of 0.15 m rms, not configured",

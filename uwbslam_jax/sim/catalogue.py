@@ -257,6 +257,13 @@ def _slow_lidar(seed: int, duration: float | None) -> Scenario:
     return replace(made, lidar=lidar, uwb=Uwb(beacon_pairs=False), wheels=Wheels())
 
 
+def _sparse(seed: int, duration: float | None) -> Scenario:
+    """A log of old: a scan of half a circle every metre, wheels in between."""
+    made = _hall(seed, duration or 300.0, speed=0.4)
+    lidar = Lidar(rate=0.4, beams=181, field_of_view=np.pi, time_increment=1.0 / 75.0 / 360.0)
+    return replace(made, lidar=lidar, uwb=Uwb(rate=5.0, outliers=0.02), wheels=Wheels(rate=10.0))
+
+
 def _lever_arms(seed: int, duration: float | None) -> Scenario:
     made = _hall(seed, duration, height=1.4)
     return replace(made, lidar=Lidar(pose=(0.3, 0.0, np.deg2rad(10.0))), uwb=Uwb(antenna=(0.0, 0.2, 0.6)))
@@ -307,6 +314,7 @@ _MAKERS: dict[str, Callable[[int, float | None], Scenario]] = {
     "uwb_silent": _uwb_silent,
     "kidnapped": _kidnapped,
     "slow_lidar": _slow_lidar,
+    "sparse": _sparse,
     "lever_arms": _lever_arms,
     "biased": _biased,
     "office": _office,
