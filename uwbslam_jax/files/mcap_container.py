@@ -302,18 +302,19 @@ class McapFile:
     def _messages(self, content: bytes, channels: set[int] | None) -> list[RawMessage]:
         """Whole messages of these channels in file order; schemas and channels on the way are learnt."""
         found: list[RawMessage] = []
-        position, size = 0, len(content)
-        while position + _HEADER.size <= size:
+        is_message, head, whole = int(Opcode.MESSAGE), _HEADER.size, _MESSAGE.size
+        unpack, position, size = _MESSAGE.unpack_from, 0, len(content)
+        while position + head <= size:
             opcode, length = _HEADER.unpack_from(content, position)
-            end = position + _HEADER.size + length
+            end = position + head + length
             if end > size:
                 break
-            if opcode == Opcode.MESSAGE and length >= _MESSAGE.size - _HEADER.size:
-                _, _, channel, _, log_time, _ = _MESSAGE.unpack_from(content, position)
+            if opcode == is_message and length >= whole - head:
+                _, _, channel, _, log_time, _ = unpack(content, position)
                 if channels is None or channel in channels:
-                    found.append(RawMessage(log_time, channel, content[position + _MESSAGE.size : end]))
+                    found.append(RawMessage(log_time, channel, content[position + whole : end]))
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self._learn(opcode, content[position + _HEADER.size : end])
+                self._learn(opcode, content[position + head : end])
             position = end
         return found
 

@@ -149,10 +149,10 @@ class Recording:
 
     def _timed(self, clocks: MessageClocks, decoders: dict[int, Decoder]) -> Iterator[Message]:
         """Messages of some channels, on one clock."""
-        topics = {number: self._recording.channels[number].topic for number in decoders}
-        for log_time, channel, data in self._recording.records(set(decoders)):
-            topic = topics[channel]
-            for message in decoders[channel](data, log_time):
+        channels = {n: (decode, self._recording.channels[n].topic) for n, decode in decoders.items()}
+        for log_time, number, data in self._recording.records(set(decoders)):
+            decode, topic = channels[number]
+            for message in decode(data, log_time):
                 yield from clocks.take(message, log_time, topic)
         yield from clocks.flush()
 

@@ -231,6 +231,7 @@ def fast_range(options: Options) -> Callable[[bytes, int], list[Message]]:
     """Decoder of UwbRange without the generic machinery: recordings hold hundreds of them a second."""
     heads = [struct.Struct(order + "iII") for order in "><"]
     tails = [struct.Struct(order + "IIfff") for order in "><"]
+    unit = METRES.get(options.unit, 1.0)
 
     def decode(data: bytes, log_time: int) -> list[Message]:
         try:
@@ -242,7 +243,7 @@ def fast_range(options: Options) -> Callable[[bytes, int], list[Message]]:
         except (struct.error, IndexError, ValueError):
             options.dropped[RangeLost.MALFORMED] += 1
             return []
-        metres = measured * options.scale * METRES.get(options.unit, 1.0)
+        metres = measured * options.scale * unit
         return checked(RangeMessage(stamp, source, target, metres, *powers), options)
 
     return decode

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field
+from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -261,12 +262,13 @@ class ScanReader:
     def _returns(self, ranges: np.ndarray, limits: tuple[float, float]) -> np.ndarray:
         """Readings (n,) [m], inf where one between the limits [m] means no return all the same."""
         low, high = limits
-        within = ranges[(ranges > low) & (ranges < high)]
-        enough = max(_FEWEST_EQUAL, _SHARE_EQUAL * ranges.size)
-        if within.size >= enough:
-            top = float(within.max())
-            count = int(np.count_nonzero(within == top))
-            if count >= enough and top not in self._no_return:
+        enough = max(_FEWEST_EQUAL, math.ceil(_SHARE_EQUAL * ranges.size))
+        rising, edges = np.sort(ranges), np.array([low, high, math.inf], np.float32)  # NaN come last
+        first, below, finite = rising.searchsorted(edges).tolist()
+        if below >= enough and rising[below - enough] == rising[below - 1] > low:
+            top = float(rising[below - 1])
+            if top not in self._no_return:
+                count = below - int(rising.searchsorted(rising[below - 1]))
                 self._equal[top] += 1
                 if self._equal[top] >= _SCANS_EQUAL or count >= _MOST_EQUAL * ranges.size:
                     self._no_return.append(top)
@@ -276,12 +278,13 @@ class ScanReader:
                     )
         for value in self._no_return:
             ranges = np.where(np.abs(ranges - value) <= _ROUNDING * value, np.float32(math.inf), ranges)
-        beyond = ranges[(ranges >= high) & (ranges < math.inf)] if math.isfinite(high) else within[:0]
-        if beyond.size >= enough and (edge := float(beyond.max()) - high) <= _BLUR * high:
-            near = (ranges > high - _NOISE_BELOW * edge) & (ranges < high)
-            ranges = np.where(near, np.float32(math.inf), ranges)
-        if low > 0.0 and np.count_nonzero(ranges == np.float32(low)) >= enough:
-            ranges = np.where(ranges == np.float32(low), np.float32(math.inf), ranges)
+        if finite - below >= enough:
+            beyond = ranges[(ranges >= high) & (ranges < math.inf)]
+            if beyond.size >= enough and (edge := float(beyond.max()) - high) <= _BLUR * high:
+                near = (ranges > high - _NOISE_BELOW * edge) & (ranges < high)
+                ranges = np.where(near, np.float32(math.inf), ranges)
+        if low > 0.0 and first + enough <= ranges.size and rising[first + enough - 1] == edges[0]:
+            ranges = np.where(ranges == edges[0], np.float32(math.inf), ranges)
         return ranges
 
 
@@ -291,6 +294,7 @@ def frame_of(message: Any) -> str:
     return name.lstrip("/") if isinstance(name, str) else ""
 
 
+@lru_cache(maxsize=16)
 def _bearings(first: float, last: float, increment: float, readings: int) -> _Bearings | None:
     """Bearings of a scan's readings out of angle_min, angle_max and angle_increment; None where they cannot be.
 

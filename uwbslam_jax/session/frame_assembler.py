@@ -7,10 +7,12 @@ gives every node id a slot, checks stamps and counts what it drops.
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from collections import Counter, deque
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
+from operator import attrgetter
 
 import numpy as np
 
@@ -52,6 +54,8 @@ _ODOMETRY_EVERY_S = 0.08
 """Frames made by the odometry are at least so far apart."""
 _ODOMETRY_LAGS_S = 15.0
 """Ranges wait this long for odometry that has come before."""
+_LATEST = 500_000_000
+"""Ranges from so long before the last frame are too late, the radio's latency aside [ns]."""
 _LONGEST_S = 3600.0
 """No time between two frames is taken for longer: a clock that was set by years does not make beacons wander."""
 _ODOMETRY_HOLD_S = 0.3
@@ -102,10 +106,10 @@ class FrameAssembler:
     def add(self, message: Message) -> list[StampedFrame]:
         """Frames that a message completes: none, a scan's, or those of odometry and ranges that waited too long."""
         match message:
+            case RangeMessage():  # first: they are nearly all
+                return self._add_range(message)
             case ScanMessage():
                 return self._add_scan(message)
-            case RangeMessage():
-                return self._add_range(message)
             case OdometryMessage():
                 return self._add_odometry(message)
             case TruthMessage():
@@ -131,7 +135,7 @@ class FrameAssembler:
         if self._last is not None and scan.stamp <= self._last:
             self.dropped[ScanLost.TWICE if scan.stamp == self._last else ScanLost.STAMP] += 1
             return []
-        if scan.ranges.size < 2 or not np.isfinite([scan.angle_min, scan.angle_increment]).all():
+        if scan.ranges.size < 2 or not (math.isfinite(scan.angle_min) and math.isfinite(scan.angle_increment)):
             self.dropped[ScanLost.NO_BEARINGS] += 1
             return []
         if ((scan.ranges > scan.range_min) & (scan.ranges < scan.range_max)).any():
@@ -153,33 +157,33 @@ class FrameAssembler:
             return []
         if self._latency:
             message = replace(message, stamp=message.stamp - self._latency)
-        if message.source == message.target:
+        a, b, stamp = message.source, message.target, message.stamp
+        if a == b:
             self.dropped[RangeLost.SELF] += 1
             return []
-        a, b = message.source, message.target
         pair = (a, b) if a < b else (b, a)
-        if message.stamp <= self._newest_range.get(pair, -1):
+        if stamp <= self._newest_range.get(pair, -1):
             self.dropped[RangeLost.STAMP] += 1
             return []
-        if self._last is not None and message.stamp <= self._last - int(0.5e9) - self._latency:
+        if self._last is not None and stamp <= self._last - _LATEST - self._latency:
             self.dropped[RangeLost.LATE] += 1
             return []
         if (a not in self.slots and self._slot(a) is None) or (b not in self.slots and self._slot(b) is None):
             self.dropped[RangeLost.NO_SLOT] += 1
             return []
         self.used[Sensor.RANGE] += 1
-        self._newest_range[pair] = message.stamp
+        self._newest_range[pair] = stamp
         self._ranges.append(message)
         # where there is odometry it makes the frames; one that lags is waited for, or they would lack its increment
         patience = _ODOMETRY_LAGS_S if self._odometry else 2 * self._wait_s
-        if message.stamp - (self._last or self._ranges[0].stamp) > patience * 1e9:
-            return self._without_scan(before=message.stamp)
+        if stamp - (self._last or self._ranges[0].stamp) > patience * 1e9:
+            return self._without_scan(before=stamp)
         return []
 
     def _add_odometry(self, message: OdometryMessage) -> list[StampedFrame]:
         if not self._settings.odom.use:
             return []
-        if not np.isfinite([message.x, message.y, message.yaw]).all():
+        if not (math.isfinite(message.x) and math.isfinite(message.y) and math.isfinite(message.yaw)):
             self.dropped[OdometryLost.NOT_FINITE] += 1
             return []
         if self._odometry and message.stamp <= self._odometry[-1].stamp:
@@ -233,17 +237,17 @@ class FrameAssembler:
 
     def _without_scan(self, before: int | None) -> list[StampedFrame]:
         """Frames for ranges that have waited: one whenever they span too long or fill a frame."""
-        self._ranges.sort(key=lambda m: m.stamp)
+        self._ranges.sort(key=attrgetter("stamp"))
         frames: list[StampedFrame] = []
         while self._ranges:
             first = self._last if self._last is not None else self._ranges[0].stamp
+            overdue = before is None or (before - first > self._wait_s * 1.5e9) or len(self._ranges) > self._max_ranges
+            if not overdue:
+                break
             ready = [m for m in self._ranges if m.stamp - first <= self._wait_s * 1e9 or m is self._ranges[0]][
                 : self._max_ranges
             ]
             rest = self._ranges[len(ready) :]
-            overdue = before is None or (before - first > self._wait_s * 1.5e9) or len(self._ranges) > self._max_ranges
-            if not overdue:
-                break
             # the last ones belong to what comes next, unless that comes after a pause
             if before is not None and (ready[-1].stamp >= before or (not rest and before - ready[-1].stamp <= _PAUSE)):
                 break
@@ -272,15 +276,14 @@ class FrameAssembler:
             ranges=pad_ranges(ranges, self.slots, stamp, self._max_ranges),
             odometry=odometry,
         )
-        self.blank += scan is not None and not frame.scan.valid.any()
+        self.blank += scan is not None and not np.count_nonzero(frame.scan.valid)
         self._last = stamp
         return StampedFrame(stamp, frame, dict(self.slots))
 
     def _increment(self, stamp: int) -> Odometry:
         track, last = self._odometry, self._last
-        none = Odometry(np.zeros(3, np.float32), np.bool_(False))
         if last is None or len(track) < 2 or track[0].stamp > last or stamp - track[-1].stamp > _ODOMETRY_HOLD_S * 1e9:
-            return none
+            return Odometry(np.zeros(3, np.float32), np.bool_(False))
         a, b = _pose_at(track, last), _pose_at(track, stamp)
         keep = max(0, bisect_right([m.stamp for m in track], stamp) - 2)
         del track[:keep]
@@ -314,10 +317,12 @@ def pad_scan(scan: ScanMessage | None, settings: Settings) -> Scan:
     stride = -(-scan.ranges.size // beams)
     taken = np.asarray(scan.ranges[::stride], np.float32)
     low, high = max(scan.range_min, settings.lidar.min_range), settings.lidar.max_range
-    with np.errstate(invalid="ignore"):
-        ok = np.isfinite(taken) & (taken >= low) & (taken <= high) & (taken > 0)
-        ok &= taken < scan.range_max * (1.0 - _ROUNDING)  # many tell no return as their limit itself
-    ranges[: taken.size], valid[: taken.size] = np.where(ok, taken, 0.0), ok
+    ok = (taken >= low) & (taken <= high)  # neither is true of NaN
+    ok &= taken < scan.range_max * (1.0 - _ROUNDING)  # many tell no return as their limit itself, or as inf
+    if low <= 0.0:
+        ok &= taken > 0.0
+    np.copyto(ranges[: taken.size], taken, where=ok)
+    valid[: taken.size] = ok
     turn = -1.0 if settings.robot.lidar_flip else 1.0
     return Scan(
         ranges,
