@@ -19,8 +19,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, NamedTuple
 
-import lz4.frame
-import zstandard
 from mcap import records as mcap_record_types
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
@@ -28,11 +26,12 @@ from mcap.opcode import Opcode
 from mcap.writer import Writer
 
 from uwbslam_jax.errors import LogError
+from uwbslam_jax.files.compression import DamagedError, believable, decompress
 
 MAGIC = b"\x89MCAP0\r\n"
 """What a file begins and ends with [bytes] (MCAP specification)."""
-PLAIN_BLOCK_BYTES, MAX_CHUNK_BYTES = 1 << 20, 1 << 30
-"""Unchunked messages are read so many at a time; a chunk that claims over 1 GiB is corrupt, not allocated [bytes]."""
+PLAIN_BLOCK_BYTES = 1 << 20
+"""Unchunked messages are read so many at a time [bytes]."""
 _HEADER, _MESSAGE, _CHUNK = struct.Struct("<BQ"), struct.Struct("<BQHIQQ"), struct.Struct("<QQQII")
 """Opcode, length; the same and channel, sequence, log and publish time; a chunk's first and last log time, size, crc,
 length of the compression's name [bytes] (MCAP specification, Records)."""
@@ -282,18 +281,13 @@ class McapFile:
         """The records of a block, decompressed; of a block that the file ends in, those bytes that are there."""
         file.seek(block.offset)
         stored = file.read(block.length)
-        if block.size > MAX_CHUNK_BYTES or block.compression not in ("", "zstd", "lz4"):
-            raise _CorruptError(f"a chunk of {block.size} bytes, compression {block.compression!r}, is not supported")
+        if not believable(block.size, block.length):
+            raise _CorruptError(f"a chunk of {block.length} bytes says that it unpacks to {block.size}")
         try:
-            if block.compression == "zstd":  # not in one shot: of a frame cut off we want what is there
-                content = zstandard.ZstdDecompressor().decompressobj().decompress(stored)
-            elif block.compression == "lz4":
-                content = lz4.frame.LZ4FrameDecompressor().decompress(stored)
-            else:
-                content = stored
-        except (zstandard.ZstdError, RuntimeError, ValueError, EOFError, MemoryError):
+            content = decompress(stored, block.compression, block.size + 1)  # one more than there may be
+        except DamagedError as error:
             if block.whole:
-                raise _CorruptError("a chunk does not decompress") from None
+                raise _CorruptError(f"a chunk {error}") from None
             return b""
         if block.whole and (len(content) != block.size or (block.crc and zlib.crc32(content) != block.crc)):
             raise _CorruptError("a chunk does not match its checksum")

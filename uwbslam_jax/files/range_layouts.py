@@ -78,16 +78,17 @@ def fields_of_type(definitions: dict[str, Any], name: str) -> dict[str, str]:
       definitions: type -> (constants, fields), as a rosbags type store has them.
     """
     found: dict[str, str] = {}
+    looks = iter(range(_MOST_FIELDS))
 
     def walk(name: str, prefix: str, depth: int) -> None:
         for label, (kind, about) in definitions.get(name, ((), ()))[1]:
+            if next(looks, None) is None:
+                return
             path, listed = f"{prefix}{label}", kind.name in ("ARRAY", "SEQUENCE")
             if listed:
                 (kind, about), _ = about
                 octets = kind.name == "BASE" and about[0] in ("uint8", "byte", "char", "octet")
                 path, about = (path, "octets") if octets else (f"{path}[]", about)  # an address is one thing
-            if len(found) >= _MOST_FIELDS:
-                return
             if kind.name == "NAME" and not about.endswith(("/Time", "/Duration")):
                 if depth < _DEEPEST:
                     walk(about, f"{path}.", depth + 1)

@@ -185,6 +185,8 @@ def range_taker(layout: Layout, topic: str, options: Options) -> Callable[[Any, 
             if source == target:
                 own, other = (int(get[path](place)) if path else 0 for path in layout.roles)
                 target += _OTHER_NODE * (other if other != own else int(layout.apart))
+                if not 0 <= target < 2**32:
+                    raise ValueError("no node id")
             metres = measured * METRES[unit if options.unit == "auto" else options.unit] * options.scale
             powers = [float(get[path](place)) if path else math.nan for path in layout.powers]
             at = nanoseconds(get[layout.stamp](place)) if layout.stamp else stamp_of(place.levels[-1], stamp)
@@ -220,11 +222,18 @@ def topic_name(topic: str, topics: list[str]) -> str:
 def nanoseconds(value: Any) -> int:
     """Nanoseconds of a ROS time, of seconds as a float, or of an integer of nanoseconds."""
     if isinstance(value, float | np.floating):
-        return round(float(value) * 1e9)
+        return within_int64(round(float(value) * 1e9))
     if hasattr(value, "sec"):
         nanosec = getattr(value, "nanosec", None)
-        return int(value.sec) * 1_000_000_000 + int(value.nsec if nanosec is None else nanosec)
-    return int(value)
+        return within_int64(int(value.sec) * 1_000_000_000 + int(value.nsec if nanosec is None else nanosec))
+    return within_int64(int(value))
+
+
+def within_int64(stamp: int) -> int:
+    """A stamp [ns] as it is. Raises OverflowError where int64 cannot hold it: JSON and protobuf have longer numbers."""
+    if not -(1 << 63) <= stamp < 1 << 63:
+        raise OverflowError("no time")
+    return stamp
 
 
 def fast_range(options: Options) -> Callable[[bytes, int], list[Message]]:

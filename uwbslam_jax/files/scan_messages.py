@@ -55,6 +55,10 @@ _RENAMED_S = 2.0
 """A scanner that is silent for so long while another frame_id goes on was renamed [s]."""
 
 
+_VARINT_BYTES = 10
+"""A number of 64 bits takes at most so many [bytes] (protobuf.dev/programming-guides/encoding)."""
+
+
 class _Bearings(NamedTuple):
     """angle_min and angle_increment [rad]; what was amiss, a key of `_AMISS`, "" for nothing."""
 
@@ -337,13 +341,14 @@ def _ends_at(first: float, increment: float, steps: int, last: float) -> bool:
 
 
 def _varint(data: bytes, position: int) -> tuple[int, int]:
-    value = shift = 0
-    while True:
+    value = 0
+    for shift in range(0, 7 * _VARINT_BYTES, 7):
         byte = data[position]
         value |= (byte & 0x7F) << shift
-        position, shift = position + 1, shift + 7
+        position += 1
         if byte < 0x80:
             return value, position
+    raise ValueError("a number without end")
 
 
 def _wire_fields(data: bytes) -> dict[int, list[int | bytes]]:

@@ -1,13 +1,11 @@
 """What the bytes of a message say: measurements out of ROS 2, ROS 1, JSON and foxglove messages.
 
-Which layout a message has is read from the definition that its recording carries. Knows no files and does not
-choose topics; what is written is `ros_types`.
+Which layout a message has is read from the definition that its recording carries, see `definitions`. Knows no files
+and does not choose topics; what is written is `ros_types`.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import functools
 import json
 import re
 import struct
@@ -16,10 +14,9 @@ from types import SimpleNamespace
 from typing import Any, Literal
 
 from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
 
 from uwbslam_jax.errors import LogError
+from uwbslam_jax.files.definitions import store_of
 from uwbslam_jax.files.mcap_container import Channel
 from uwbslam_jax.files.pose_messages import odometry_parts, take_odometry, take_truth
 from uwbslam_jax.files.range_layouts import (
@@ -162,7 +159,7 @@ def _is_described(channel: Channel, options: Options) -> bool:
 
 def _range_layout(channel: Channel, options: Options) -> Layout:
     """The layout of a channel with a definition: the user's, or one that is told by the fields. Raises LogError."""
-    store, name = _store_of(dataclasses.replace(channel, id=0))
+    store, name = store_of(channel)
     fields = fields_of_type(store.fielddefs, name)
     if _is_described(channel, options):
         layout = described(options.message)
@@ -216,7 +213,7 @@ def _base_name(schema: str) -> str:
 def _unpacker(channel: Channel, role: Role) -> tuple[Callable[[bytes], Any], set[str] | None]:
     """From bytes to an object with the message's fields, and the names of these where there is a definition."""
     if channel.encoding in ("cdr", "ros1"):
-        store, name = _store_of(dataclasses.replace(channel, id=0))
+        store, name = store_of(channel)
         fields = {field_name for field_name, _ in store.fielddefs[name][1]}
         decode = store.deserialize_cdr if channel.encoding == "cdr" else store.deserialize_ros1
         return (lambda data: decode(data, name)), fields
@@ -230,44 +227,17 @@ def _unpacker(channel: Channel, role: Role) -> tuple[Callable[[bytes], Any], set
     )
 
 
-@functools.lru_cache(maxsize=64)
-def _store_of(channel: Channel) -> tuple[Typestore, str]:
-    """The types that a channel's definition defines, and the full name of its own."""
-    name = re.sub(r"^([^/]+)/([^/]+)$", r"\1/msg/\2", channel.schema)
-    text = channel.definition.decode("utf-8", "replace")
-    try:
-        if not text.strip():
-            return STORE, STORE.get_msgdef(name).name
-        store = get_typestore(Stores.EMPTY)
-        if channel.schema_encoding in ("ros2idl", "omgidl"):
-            types = {}
-            for part in re.split(r"^=+\s*\n", text, flags=re.MULTILINE):
-                part = re.sub(r"^(#.*|IDL: .*)$", "", part, flags=re.MULTILINE)  # rosbags' grammar has no #include
-                types |= get_types_from_idl(part) if part.strip() else {}
-        else:
-            types = get_types_from_msg(text, name)
-        if channel.encoding == "ros1":  # there time is a type of the language, in no definition
-            types |= get_types_from_msg("uint32 sec\nuint32 nanosec\n", "builtin_interfaces/msg/Time")
-        known = {key: value for key, value in types.items() if key not in store.fielddefs}
-        store.register(known)
-        store.get_msgdef(name)
-    except (TypesysError, KeyError, ValueError, SyntaxError, RecursionError) as error:
-        reason = " ".join([type(error).__name__, *str(error).splitlines()[:1]])
-        raise LogError(f"topic {channel.topic}: unreadable definition of {channel.schema!r}: {reason}") from None
-    return store, name
-
-
 def _is_our_range(channel: Channel) -> bool:
     """Whether a channel holds CDR messages laid out exactly as UwbRange, whatever their name."""
     if channel.encoding != "cdr":
         return False
-    store, name = _store_of(dataclasses.replace(channel, id=0))
+    store, name = store_of(channel)
     pairs = [(name, UWB_RANGE)] + [(t, t) for t in ("std_msgs/msg/Header", "builtin_interfaces/msg/Time")]
     return all(t in store.fielddefs and store.fielddefs[t][1] == STORE.fielddefs[own][1] for t, own in pairs)
 
 
 def _stamp(message: Any, otherwise: int = 0) -> int:
-    """Time of a message [ns]: its header's, or its own; another where it has neither, or 0."""
+    """Time of a message [ns]: its header's, or its own; another where it has neither, or 0. Raises OverflowError."""
     time = getattr(message, "header", message)
     time = getattr(time, "stamp", None) or getattr(time, "timestamp", None)
     return otherwise if time is None else nanoseconds(time) or otherwise

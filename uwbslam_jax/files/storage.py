@@ -21,6 +21,7 @@ import zstandard
 from rosbags.rosbag1 import Reader, ReaderError
 
 from uwbslam_jax.errors import LogError
+from uwbslam_jax.files.compression import DamagedError, decompress
 from uwbslam_jax.files.mcap_container import MAGIC, Channel, McapFile, RawMessage
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
@@ -104,9 +105,8 @@ def open_part(path: Path) -> Part:
 def unpack_message(data: bytes) -> bytes:
     """What rosbag2 compressed with zstd message by message; as it is where it does not unpack."""
     try:
-        with zstandard.ZstdDecompressor().stream_reader(data) as plain:
-            found = plain.read(_LARGEST_MESSAGE + 1)
-    except zstandard.ZstdError:
+        found = decompress(data, "zstd", _LARGEST_MESSAGE + 1)
+    except DamagedError:
         return data
     return found if len(found) <= _LARGEST_MESSAGE else data
 
