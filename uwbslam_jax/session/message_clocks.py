@@ -128,12 +128,14 @@ class MessageClocks:
         if own is None:
             own = self._topics[topic] = TopicClock(topic, type(message), rate=self._rates.get(topic, 1.0))
         stamp = message.stamp
-        if log_time is not None:
+        if log_time is not None and log_time < _ABSURD:  # else it is nobody's
             if log_time < self._raw_log - _LOG_BACK:
                 self._leap += self._raw_log - log_time
             self._raw_log = log_time
             log_time += self._leap
-        elif not -_ABSURD < stamp < _ABSURD:
+        elif -_ABSURD < stamp < _ABSURD:
+            log_time = None
+        else:
             self._drop(own)
             return []
         # nearly all messages: what `_good` does, as far as it is to be done here
