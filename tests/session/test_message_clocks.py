@@ -247,7 +247,7 @@ def test_what_is_told_keeps_its_subject_while_its_counts_grow() -> None:
 @pytest.mark.parametrize("stamped", [False, True])
 def test_a_log_time_that_is_nobodys_says_nothing(stamped: bool) -> None:
     rows = drive()
-    message, at = rows[200]
+    message, _ = rows[200]
     rows[200] = message if stamped else dataclasses.replace(message, stamp=0), 2**64 - 1
     clocks = MessageClocks()
     wanted = [m for m, _ in drive()]
