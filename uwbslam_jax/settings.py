@@ -86,12 +86,26 @@ class Config:
 
 
 @dataclass(frozen=True)
+class Found:
+    """What a run has found its ranging to be off by, beyond what is configured.
+
+    Attributes:
+      bias: slot -> range bias of the node [m]. height: slot -> of its antenna [m]. scale: of all ranges [m/m].
+    """
+
+    bias: dict[int, float] = field(default_factory=dict)
+    height: dict[int, float] = field(default_factory=dict)
+    scale: float = 0.0
+
+
+@dataclass(frozen=True)
 class HostParams:
     """What the host takes a range for, in float64: the model of `estimator.ranging` the other way round.
 
     Attributes:
       antenna, bias, bias_scale, height, lidar: see Params.
       sigma_n, nlos_gap_db: see UwbSettings.
+      surveyed: (K,) whether the height of a node's antenna was configured.
     """
 
     antenna: Float[np.ndarray, "2"]
@@ -101,6 +115,7 @@ class HostParams:
     lidar: Float[np.ndarray, "3"]
     sigma_n: float
     nlos_gap_db: float
+    surveyed: Bool[np.ndarray, "K"]
 
     def slant(self, measured: Metres, i: Slot, j: Slot) -> Metres:
         """Distance of two antennas in space [m] for a range measured between slots, or for several."""
@@ -114,6 +129,16 @@ class HostParams:
         """Distance in the plane [m]; at least 0.1, however short the range is."""
         flat: Any = np.sqrt(np.maximum(self.slant(measured, i, j) ** 2 - self.rise(i, j) ** 2, 0.01))
         return flat
+
+    def beyond(self, found: Found) -> HostParams:
+        """The same with what a run has found as well."""
+        bias, height = self.bias.copy(), self.height.copy()
+        for slot, more in found.bias.items():
+            bias[slot] += (1.0 + self.bias_scale) * more
+        for slot, more in found.height.items():
+            height[slot] += more
+        scale = (1.0 + self.bias_scale) * (1.0 + found.scale) - 1.0
+        return replace(self, bias=bias, height=height, bias_scale=scale)
 
     def usable(self, ranges: Ranges) -> Bool[np.ndarray, "M"]:
         """Which ranges of a frame are measured, and not NLOS by their powers; see `ranging.line_of_sight`."""
@@ -312,14 +337,12 @@ def make_config(settings: Settings) -> Config:
     )
 
 
-def make_params(
-    settings: Settings, slots: dict[int, int] | None = None, found_bias: dict[int, float] | None = None
-) -> Params:
+def make_params(settings: Settings, slots: dict[int, int] | None = None, found: Found | None = None) -> Params:
     """The tunable part of the settings.
 
     Args:
       slots: node id -> slot, for the biases and heights that are given by id; ids without a slot are left out.
-      found_bias: slot -> range bias beyond the configured one [m].
+      found: beyond what is configured.
     """
     f, odom = settings.filter, settings.odom
     k = 1 + settings.uwb.max_beacons
@@ -329,19 +352,26 @@ def make_params(
         bias[slot] = settings.uwb.bias.get(str(node), 0.0)
         if slot > 0:
             height[slot] = settings.uwb.height.get(str(node), settings.robot.antenna[2])
-    for slot, found in (found_bias or {}).items():
-        bias[slot] += found
+    found = found or Found()
+    scale = settings.uwb.bias_scale
+    for slot, more in found.bias.items():
+        bias[slot] += (1.0 + scale) * more
+    for slot, more in found.height.items():
+        height[slot] += more
     of_filter = ("gamma", "sigma_w", "sigma_w_paper", "sigma_w_yaw", "sigma_w_beacon", "sigma_w_carried")
     leaves: dict[str, Any] = {name: getattr(f, name) for name in of_filter}
     leaves |= {name: getattr(f, name) for name in ("sigma_l", "independent_beams", "sigma_map", "sigma_map_yaw")}
     leaves |= {f"odom_{name}": getattr(odom, name) for name in ("sigma_xy", "sigma_yaw", "sigma_floor")}
     leaves |= {"sigma_n": settings.uwb.sigma_n, "antenna": settings.robot.antenna[:2], "lidar": settings.robot.lidar}
-    leaves |= {"bias": bias, "bias_scale": settings.uwb.bias_scale, "height": height}
+    leaves |= {"bias": bias, "bias_scale": (1.0 + scale) * (1.0 + found.scale) - 1.0, "height": height}
     return Params(**{name: jnp.asarray(value, jnp.float32) for name, value in leaves.items()})
 
 
-def make_host_params(settings: Settings, params: Params) -> HostParams:
-    """What the host needs of the settings and of the parameters made from them."""
+def make_host_params(settings: Settings, params: Params, slots: dict[int, int] | None = None) -> HostParams:
+    """What the host needs of the settings and of the parameters made from them. slots: node id -> slot."""
     leaves = {name: np.asarray(getattr(params, name), float) for name in ("antenna", "bias", "height", "lidar")}
     uwb = settings.uwb
-    return HostParams(**leaves, bias_scale=float(params.bias_scale), sigma_n=uwb.sigma_n, nlos_gap_db=uwb.nlos_gap_db)
+    surveyed = np.zeros(len(leaves["height"]), bool)
+    surveyed[[0, *(slot for node, slot in (slots or {}).items() if str(node) in uwb.height)]] = True
+    scale, sigma_n, gap = float(params.bias_scale), uwb.sigma_n, uwb.nlos_gap_db
+    return HostParams(**leaves, bias_scale=scale, sigma_n=sigma_n, nlos_gap_db=gap, surveyed=surveyed)

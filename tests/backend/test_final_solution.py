@@ -19,7 +19,7 @@ from uwbslam_jax.numerics.se2_host import wrapped
 from uwbslam_jax.result import EventKind
 from uwbslam_jax.session.result_builder import Facts, to_result
 from uwbslam_jax.session.session import CONTROL_EVERY, Session
-from uwbslam_jax.settings import FilterSettings, UwbSettings
+from uwbslam_jax.settings import FilterSettings, Found, UwbSettings
 
 NODES = (10, 20, 30)
 BIAS = {10: 0.6, 20: -0.5, 30: 0.5}
@@ -80,7 +80,7 @@ def test_a_finished_run_is_better_than_what_was_published(finished) -> None:
     assert rms < 0.02  # scans of 60 beams, their walls known to some centimetres
     assert rms < np.sqrt(np.mean(published**2))
     assert beacons.max() < 0.03
-    assert not run.found_bias
+    assert run.found == Found()
 
 
 def test_it_is_in_the_published_frame(finished) -> None:
@@ -117,7 +117,7 @@ def test_biases_are_found_on_the_way_and_mend_the_state(biased) -> None:
     robot, _ = off(run, run.hindsight.track, truth)
     assert np.sqrt(np.mean(robot**2)) < 0.02
     for node, bias in BIAS.items():
-        assert run.found_bias[0] + run.found_bias[run.slots[node]] == pytest.approx(bias, abs=0.15)
+        assert run.found.bias[0] + run.found.bias[run.slots[node]] == pytest.approx(bias, abs=0.15)
     # the state itself has them, not only the files
     last = np.array(run.history.poses)[-50:]
     late, _ = off(run, last, truth[-50:])
@@ -177,7 +177,7 @@ def test_a_revision_may_take_the_longer_the_longer_the_run_is(finished, keyframe
     graph = Graph()
     graph.keyframes.extend(np.zeros(keyframes, KEYFRAME))
     run, reviser = finished[0], Reviser()
-    question = Question(graph, np.zeros((keyframes, 3)), {}, run.host, ((1, 0), (2, 0)), False)
+    question = Question(graph, np.zeros((keyframes, 3)), {}, run.host, ((1, 0), (2, 0)), Found())
     reviser.begin(run.config, run.params, question, 0.05, 0.0)
     for _ in range(looks - 1):
         assert reviser.look(lambda solution: True) is None

@@ -10,6 +10,7 @@ from uwbslam_jax.backend import smoothing
 from uwbslam_jax.backend.graph import Graph
 from uwbslam_jax.numerics import Stage, sparse_least_squares
 from uwbslam_jax.numerics.se2_host import between
+from uwbslam_jax.settings import Found
 
 
 def apart(found: smoothing.Solution, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -30,7 +31,7 @@ def test_a_run_is_solved_to_millimetres() -> None:
     robot, beacons = apart(found, truth)
     assert np.sqrt(np.mean(robot**2)) < 0.01  # edges of 5 mm, closed every round
     assert beacons.max() < 0.03  # 158 means of 5 cm
-    assert not found.biased
+    assert found.found == Found()
     drifted = np.sqrt(np.mean(np.sum((graph.poses()[:, :2] - truth[:, :2]) ** 2, axis=1)))
     assert drifted > 0.03  # what it started from was worse
 
@@ -73,12 +74,12 @@ def test_biases_are_found_and_not_invented() -> None:
     truth = loop()
     bias = {0: 0.05, 1: 0.2, 2: -0.15, 3: 0.1, 4: -0.2}
     found = solved(make(truth, bias=bias))
-    assert found.biased
+    assert found.found.bias
     assert nees(found, truth) < 26.1  # chi-square of 8 degrees of freedom, 0.1 %
     for slot in bias:
-        assert abs(found.bias[slot] - bias[slot]) < 3.3 * found.bias_sigma[slot]
-        assert found.bias_sigma[slot] < 0.15
-    assert not solved(make(truth, seed=5)).biased
+        assert abs(found.off.bias[slot] - bias[slot]) < 3.3 * found.sigma.bias[slot]
+        assert found.sigma.bias[slot] < 0.15
+    assert solved(make(truth, seed=5)).found == Found()
 
 
 def test_configured_biases_and_heights_are_taken_off() -> None:
@@ -89,7 +90,7 @@ def test_configured_biases_and_heights_are_taken_off() -> None:
     offset = bias[0] + bias[means["slot"]]
     means["distance"] = np.hypot(means["distance"] - offset, 1.5) + offset
     found = solved(graph, bias=bias, height=np.array([0.0, 1.5, 1.5, 1.5, 1.5]))
-    assert not found.biased
+    assert found.found == Found()
     assert apart(found, truth)[1].max() < 0.03
 
 
@@ -119,15 +120,17 @@ def test_derivatives_agree_with_differences() -> None:
     graph.keyframes["informed"][:] = 0.0  # blind: the even drive counts
     places = {(slot, 0): spot for slot, spot in BEACONS.items()}
     ranging = host(height=np.array([0.0, 1.0, 0.5, 0.0, 2.0]), bias_scale=0.02)
-    problem = smoothing.Problem.build(graph, graph.poses(), places, ranging)
+    graph.keyframes["wheels"][3:8] = between(truth[2:7], truth[3:8])  # so that their scale is an unknown as well
+    problem = smoothing.Problem.build(graph, graph.poses(), places, ranging).freed(("bias", "height", "scale"))
+    assert problem.size == 3 * 12 + 8 + 5 + 4 + 3
     rng = np.random.default_rng(3)
     x = problem.start(graph.poses() + rng.normal(0, 0.05, truth.shape), places)
-    x[-5:] += rng.normal(0, 0.05, 5)
-    stage, sigmas = Stage(1e6, 1.0), 0.3  # edges not softened: their reweighting is no derivative of the residual
-    fill = problem.rows(x[:3].copy(), sigmas, stage)
+    x[-12:] += rng.normal(0, 0.05, 12)
+    stage = Stage(1e6, 1.0)  # edges not softened: their reweighting is no derivative of the residual
+    fill = problem.rows(x[:3].copy(), stage)
     J, _ = stacked(fill, x)
     h = 1e-6
-    for column in rng.choice(len(x), 40, replace=False):
+    for column in {*rng.choice(len(x), 40, replace=False), *range(len(x) - 12, len(x))}:
         e = h * np.eye(len(x))[column]
         want = (stacked(fill, x + e)[1] - stacked(fill, x - e)[1]) / (2 * h)
         np.testing.assert_allclose(J[:, column], want, rtol=1e-4, atol=1e-4 * max(1, abs(want).max()))
@@ -141,7 +144,7 @@ def test_normal_equations_are_those_of_the_rows(monkeypatch) -> None:
     places = {(slot, 0): spot for slot, spot in BEACONS.items()}
     problem = smoothing.Problem.build(graph, graph.poses(), places, host())
     x = problem.start(graph.poses() + np.random.default_rng(5).normal(0, 0.05, truth.shape), places)
-    fill = problem.rows(x[:3] + 1e-5, 0.3, Stage(30.0, 2.0))
+    fill = problem.rows(x[:3] + 1e-5, Stage(30.0, 2.0))
     J, r = stacked(fill, x)
     rank = np.random.default_rng(6).permutation(len(x))
     rows, cost = sparse_least_squares.Rows(rank), sparse_least_squares.Cost()
@@ -164,7 +167,7 @@ def test_unknowns_are_eliminated_in_an_order_that_keeps_the_factor_sparse() -> N
 
     def entries(rank: np.ndarray) -> tuple[int, int]:
         rows = sparse_least_squares.Rows(rank)
-        problem.rows(np.zeros(3), 0.3, Stage(30.0, 2.0))(problem.start(graph.poses(), places), rows)
+        problem.rows(np.zeros(3), Stage(30.0, 2.0))(problem.start(graph.poses(), places), rows)
         A = rows.normal().A
         return A.nnz // 2, sparse_least_squares._factor(A.T).L.nnz
 

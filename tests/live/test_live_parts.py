@@ -39,7 +39,7 @@ from uwbslam_jax.session import saved_state
 from uwbslam_jax.session.frame_assembler import FrameAssembler
 from uwbslam_jax.session.saved_state import Locator, Saved
 from uwbslam_jax.session.session import Session
-from uwbslam_jax.settings import MapSettings, Settings, make_config
+from uwbslam_jax.settings import Found, MapSettings, Settings, make_config
 from uwbslam_jax.web.live_page import LivePage, Status
 from uwbslam_jax.web.server import LiveView, parse_address
 
@@ -218,7 +218,7 @@ def found_before() -> Saved:
     epochs = np.asarray(state.grid.epochs)
     epochs = np.zeros((1, *(n * TILE // config.cells for n in epochs.shape[:2]), *epochs.shape[2:]), epochs.dtype)
     tiles.load(np.array([[3, -4]]), [*layers, epochs])
-    return Saved(jax.device_get(state), tiles, {0: 0, 11: 1, 12: 2, 13: 3, 14: 4}, {1: 0.15})
+    return Saved(jax.device_get(state), tiles, {0: 0, 11: 1, 12: 2, 13: 3, 14: 4}, Found({1: 0.15}, {2: 1.2}, 0.01))
 
 
 def test_what_is_saved_comes_back(tmp_path: Path) -> None:
@@ -227,7 +227,7 @@ def test_what_is_saved_comes_back(tmp_path: Path) -> None:
     back = saved_state.load(tmp_path, SMALL)
     jax.tree.map(np.testing.assert_array_equal, back.state, saved.state)
     assert back.slots == saved.slots
-    assert back.found_bias == saved.found_bias
+    assert back.found == saved.found
     places, layers = back.tiles.dump()
     assert places.tolist() == [[3, -4]]
     for mine, theirs in zip(layers, saved.tiles.dump()[1], strict=True):

@@ -195,11 +195,11 @@ def test_host_compose_and_between_are_those_of_the_device():
 
 
 def test_biased_radios_are_told():
-    assert solved(start_of_run.with_a_turn(8.0), each=10, bias={0: 0.5, 1: -0.6, 2: 0.8, 3: 0.7}).biased
+    assert solved(start_of_run.with_a_turn(8.0), each=10, bias={0: 0.5, 1: -0.6, 2: 0.8, 3: 0.7}).open == ("bias",)
 
 
 def test_calibrated_radios_are_not_called_biased():
-    assert not any(solved(start_of_run.with_a_turn(), seed=seed).biased for seed in range(5))
+    assert not any(solved(start_of_run.with_a_turn(), seed=seed).open for seed in range(5))
 
 
 def test_a_long_start_is_thinned_without_losing_ranges():

@@ -18,7 +18,7 @@ from uwbslam_jax.mapping import Tiles, redraw
 from uwbslam_jax.measurements import StampedFrame
 from uwbslam_jax.numerics import DECIDED
 from uwbslam_jax.result import EventKind
-from uwbslam_jax.settings import HostParams, Params, Settings, make_host_params, make_params
+from uwbslam_jax.settings import Found, HostParams, Params, Settings, make_host_params, make_params
 
 _ELSEWHERE = (
     EventKind.ROBOT_CARRIED,
@@ -92,14 +92,14 @@ class BackEnd:
             self._note(view, event, since)
         if any(event.kind is EventKind.ROBOT_CARRIED for event in events):
             self._reviser.drop()
-        revision = self._reviser.look(partial(is_news, state=view.state, graph=self.graph, learnt=bool(view.bias)))
+        revision = self._reviser.look(partial(is_news, state=view.state, graph=self.graph, known=view.found))
         changes = Changes()
         if revision is not None:
             self.taken_over += 1
             changes = self._take_over(view, revision)
             changes = changes._replace(events=[*changes.events, SlotEvent(0, EventKind.CORRECTED)])
         if self.enabled and self._reviser.wants(len(self.graph.keyframes)):
-            self._begin(view._replace(state=changes.state or view.state, bias=changes.bias or view.bias))
+            self._begin(view._replace(state=changes.state or view.state, found=changes.found or view.found))
         return changes
 
     def _note(self, view: HostView, event: SlotEvent, since: int) -> None:
@@ -128,28 +128,29 @@ class BackEnd:
             self.graph.ranges.node(slot): positions[slot] for slot in map(int, np.flatnonzero(resting)) if slot > 0
         }
         poses = view.poses[self.graph.keyframes["frame"]].astype(float)
-        configured = make_host_params(self.settings, make_params(self.settings, dict(view.slots)))
-        return Question(self.graph, poses, places, configured, self._frame_nodes, bool(view.bias))
+        slots = dict(view.slots)
+        configured = make_host_params(self.settings, make_params(self.settings, slots), slots)
+        return Question(self.graph, poses, places, configured, self._frame_nodes, view.found)
 
-    def _params(self, view: HostView, bias: dict[int, float] | None = None) -> Params:
-        return make_params(self.settings, dict(view.slots), dict(view.bias if bias is None else bias))
+    def _params(self, view: HostView, found: Found | None = None) -> Params:
+        return make_params(self.settings, dict(view.slots), found or view.found)
 
     def _take_over(self, view: HostView, revision: Revision) -> Changes:
         """The state as a revision has it."""
-        bias, events = self._biases(view, revision.solution)
-        params = self._params(view, bias)
+        found, events = self._found(view, revision.solution)
+        params = self._params(view, found)
         anchors, before = self.graph.stamps(), self.graph.poses()
         state = take_over(view.config, params, revision, view.state, self.graph)
         moved = Moved(anchors, before, self.graph.poses())
-        return Changes(state, revision.tiles, bias, moved=moved, events=events)
+        return Changes(state, revision.tiles, found, moved=moved, events=events)
 
-    def _biases(self, view: HostView, solution: Solution) -> tuple[dict[int, float] | None, list[SlotEvent]]:
-        """Biases that were found, None for none, and whether that is news."""
-        if not solution.biased:
+    def _found(self, view: HostView, solution: Solution) -> tuple[Found | None, list[SlotEvent]]:
+        """What ranges were found to be off by, None for nothing, and whether that is news."""
+        found, sigma_n = solution.found, self.settings.uwb.sigma_n
+        if found == Found():
             return None, []
-        sigma_n = self.settings.uwb.sigma_n
-        news = notable(solution.bias, sigma_n) and not notable(view.bias, sigma_n)
-        return solution.bias, [SlotEvent(0, EventKind.BIASED)] if news else []
+        news = notable(found.bias, sigma_n) and not notable(view.found.bias, sigma_n)
+        return found, [SlotEvent(0, EventKind.BIASED)] if news else []
 
     def finish(self, view: HostView, stamps: np.ndarray, poses: np.ndarray, sight: np.ndarray) -> Changes:
         """The run solved for the last time. stamps, poses, sight: of every frame, see look_back."""
@@ -186,8 +187,8 @@ class BackEnd:
             return Changes()
         self.hindsight = self._on_time(self.hindsight, question, stamps, (poses, sight))
         solution = self.hindsight.solution
-        bias, _ = self._biases(view, solution)
-        params = self._params(view, bias)
+        found, _ = self._found(view, solution)
+        params = self._params(view, found)
         tiles = Tiles(self.settings.map.resolution)
         grid = redraw(view.config, params, tiles, self.graph.seen(solution.poses), self.hindsight.track[-1, :2])
         return self._take_over(view, Revision(solution, grid, tiles))

@@ -15,7 +15,7 @@ from uwbslam_jax.backend.range_means import Node
 from uwbslam_jax.backend.smoothing import Solution, solve
 from uwbslam_jax.estimator import frame_motion, published
 from uwbslam_jax.numerics import between, compose, numeric_jacobian, rigid_fit, transformed, wrapped
-from uwbslam_jax.settings import HostParams
+from uwbslam_jax.settings import Found, HostParams
 
 
 class Question(NamedTuple):
@@ -26,7 +26,7 @@ class Question(NamedTuple):
       places: resting place of a beacon -> where it is, about (2,) [m].
       host: with the heights and biases that the user configured.
       frame_nodes: the resting places that make the published frame: its origin, and +x.
-      biased: whether ranges were found to be biased before.
+      known: what ranges were found to be off by before.
     """
 
     graph: Graph
@@ -34,7 +34,7 @@ class Question(NamedTuple):
     places: dict[Node, np.ndarray]
     host: HostParams
     frame_nodes: tuple[Node, Node]
-    biased: bool
+    known: Found
 
 
 class Hindsight(NamedTuple):
@@ -63,8 +63,8 @@ def look_back(question: Question, stamps: np.ndarray, poses: np.ndarray, sight: 
 
 def framed_solution(question: Question) -> Solution | None:
     """The solution, and its covariance, in the published frame."""
-    graph, poses, places, host, frame_nodes, biased = question
-    solution = solve(graph, poses, places, host, biased=biased)
+    graph, poses, places, host, frame_nodes, known = question
+    solution = solve(graph, poses, places, host, known)
     return None if solution is None else _framed(solution, poses, frame_nodes)
 
 

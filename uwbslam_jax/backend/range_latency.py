@@ -67,8 +67,8 @@ def find_latency(hindsight: Hindsight, graph: Graph, stamps: np.ndarray, host: H
         return None
     way, time = _Way(hindsight, stamps, host), (means["stamp"] - float(stamps[0])) / 1e9
     slot, sigma = means["slot"], np.maximum(means["sigma"].astype(float), 1e-3)
-    bias = np.array([solution.bias.get(k, 0.0) for k in slot.tolist()]) + solution.bias.get(0, 0.0)
-    distance = host.slant(means["distance"].astype(float), 0, slot) - bias
+    host = host.beyond(solution.off)
+    distance = host.slant(means["distance"].astype(float), 0, slot)
     rise = np.asarray(host.rise(0, slot), float)
     count, row = len(solution.nodes), np.arange(len(means))
     # unknowns: how late, then place and bias of each beacon

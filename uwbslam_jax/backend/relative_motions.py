@@ -47,6 +47,7 @@ def steps(graph: Graph, poses: np.ndarray) -> Edges:
         np.concatenate([z, sure, edges["between"]]),
         np.concatenate(roots),
         np.arange(len(z) + len(sure) + len(edges)) >= len(z),
+        np.append(rolled, np.zeros(len(sure) + len(edges), bool)),
     )
 
 

@@ -21,7 +21,7 @@ from uwbslam_jax.backend.smoothing import Solution
 from uwbslam_jax.estimator import State, anchored, state_vector
 from uwbslam_jax.mapping import Grid, Tiles, draw_onto, redraw
 from uwbslam_jax.numerics import SIGMA_ENOUGH_M, SingularError, between, compose, largest_sigma, rigid_fit, wrapped
-from uwbslam_jax.settings import Config, Params
+from uwbslam_jax.settings import Config, Found, Params
 
 UNSOLVED = (SingularError, np.linalg.LinAlgError)
 """What a solution of the run raises where its equations have none [exceptions]: the run goes on without."""
@@ -39,6 +39,8 @@ _NEWS = 9.0
 """Squared Mahalanobis distance of a beacon from where the state has it, beyond which that is wrong."""
 _NEWS_M = 0.03
 """Whatever the state believes: a beacon or a keyframe that is off by less is no news [m]."""
+_NEWS_HEIGHT_M, _NEWS_SCALE = 0.1, 0.003
+"""The same of a height [m] and of the ranges' scale [m/m]: some metres away they come to as much."""
 _WALK = (0.004, 0.004, 0.0006)
 """Standard deviation of what the pose drifts on the way since the last keyframe that was solved [m, m, rad / m^0.5]."""
 _FLOOR_M = 0.01
@@ -140,13 +142,13 @@ class Reviser:
             self._pool = None
 
 
-def is_news(solution: Solution, state: State, graph: Graph, *, learnt: bool) -> bool:
+def is_news(solution: Solution, state: State, graph: Graph, known: Found) -> bool:
     """Whether a solution contradicts the state: a beacon stands elsewhere, or the map was drawn elsewhere.
 
     One that ends before the robot was carried off cannot be carried on to now, and is none.
 
     Args:
-      learnt: whether biases are known already.
+      known: what ranges were found to be off by before.
     """
     count = len(solution.poses)
     if graph.keyframes["broken"][count:].any():
@@ -154,7 +156,7 @@ def is_news(solution: Solution, state: State, graph: Graph, *, learnt: bool) -> 
     slots, places, at = _current(solution, graph)
     if len(slots) < 2:
         return False
-    if solution.biased and not learnt:
+    if _differs(solution.found, known):
         return True
     mean, P = np.asarray(state.belief.mean, float), np.asarray(state.belief.cov, float)
     for slot, place, b in zip(slots, places, at, strict=True):
@@ -164,6 +166,15 @@ def is_news(solution: Solution, state: State, graph: Graph, *, learnt: bool) -> 
             return True
     off = np.linalg.norm(solution.poses[:, :2] - graph.poses()[:count, :2], axis=1)
     return bool(np.sqrt(np.mean(off**2)) > _NEWS_M)
+
+
+def _differs(found: Found, known: Found) -> bool:
+    """Whether what ranges are off by is not what was known of it."""
+    if found.bias.keys() - known.bias or found.height.keys() - known.height or bool(found.scale) != bool(known.scale):
+        return True
+    off = max((abs(found.bias[slot] - known.bias.get(slot, 0.0)) for slot in found.bias), default=0.0)
+    high = max((abs(found.height[slot] - known.height.get(slot, 0.0)) for slot in found.height), default=0.0)
+    return off > _NEWS_M or high > _NEWS_HEIGHT_M or abs(found.scale - known.scale) > _NEWS_SCALE
 
 
 def take_over(config: Config, params: Params, revision: Revision, state: State, graph: Graph) -> State:

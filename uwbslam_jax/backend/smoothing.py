@@ -1,4 +1,4 @@
-"""The whole run solved at once: the poses, resting beacons and range biases that explain scans, steps and ranges.
+"""The whole run solved at once: poses, resting beacons and what ranges are off by, to explain scans, steps and ranges.
 
 Sparse Gauss-Newton in float64 over the `graph`. The filter decides with what it knew at the time; this takes back what
 the rest of the run tells about it (in the words of the field: the back end; for a linear problem, the smoother).
@@ -6,7 +6,8 @@ the rest of the run tells about it (in the words of the field: the back end; for
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -16,24 +17,26 @@ from uwbslam_jax.backend.range_means import Node
 from uwbslam_jax.backend.relative_motions import even_drive, steps
 from uwbslam_jax.numerics import (
     CALIBRATED_M,
-    DECIDED,
+    Freedom,
+    Off,
     Pairs,
     PoseGraph,
     Stage,
     TrackRanges,
     covariance,
+    fewest_open,
     median_range,
     widened,
 )
-from uwbslam_jax.settings import HostParams
+from uwbslam_jax.settings import Found, HostParams
 
-BIASED_M = 0.3
-"""Standard deviation of a node's bias when ranges are not taken to be calibrated [m]."""
 _STAGES = (Stage(soft=1000.0, coarse=4.0), Stage(soft=30.0, coarse=2.0), Stage(soft=5.0, coarse=1.0))
 """One solution after the other. The filter's track may be far off for what two scans tell, and nothing must be an
 outlier only because the start is wrong."""
 _FEWEST_MEANS = 6
 """A resting place that was ranged less takes no part: fewer averages leave more than one place for it."""
+_RADIO = 0.8
+"""Where so many of the means to each place are loud, it is the radio that is, and no wall in between [share]."""
 _MOVES, _ENOUGH = 25, 0.05
 """Moves of a stage at most [moves]: a bound for starts far off; one that gains less log-likelihood than this is the
 last."""
@@ -45,8 +48,9 @@ class Solution(NamedTuple):
     Attributes:
       poses: (N, 3) of the keyframes [m, m, rad].
       nodes: resting places of the beacons; beacons: (B, 2) where they are [m].
-      bias, bias_sigma: node slot -> bias beyond the configured one [m], about 0 where ranges are calibrated.
-      biased: whether it has biases: they explain the ranges far better than none.
+      off, sigma: what ranges are off by beyond what is configured, and how well that is known. Of heights those that
+        nobody has measured, none where all are as good as that of the robot.
+      freedom: what was left open for that: it explains the ranges far better than what is configured.
       cost: negative log-likelihood.
       cov: (3 + 2 B, 3 + 2 B) of the last pose and the beacons while the first pose is held.
     """
@@ -54,11 +58,16 @@ class Solution(NamedTuple):
     poses: np.ndarray
     nodes: list[Node]
     beacons: np.ndarray
-    bias: dict[int, float]
-    bias_sigma: dict[int, float]
-    biased: bool
+    off: Found
+    sigma: Found
+    freedom: Freedom
     cost: float
     cov: np.ndarray
+
+    @property
+    def found(self) -> Found:
+        """What is off, without biases where ranges are taken to be calibrated."""
+        return self.off if self.freedom.bias > CALIBRATED_M else replace(self.off, bias={})
 
 
 def solve(
@@ -66,8 +75,7 @@ def solve(
     poses: np.ndarray,
     places: dict[Node, np.ndarray],
     host: HostParams,
-    *,
-    biased: bool = False,
+    known: Found | None = None,
 ) -> Solution | None:
     """The run solved; None where there is nothing to solve.
 
@@ -75,16 +83,59 @@ def solve(
       poses: (N, 3) of the keyframes to start from [m, m, rad].
       places: resting place -> (2,) to start from [m]; others are left out.
       host: with biases and heights as configured.
-      biased: whether biases were found before.
+      known: what was found before; what is not 0 of it stays open.
     """
     problem = Problem.build(graph, poses, places, host)
     if problem is None:
         return None
-    x = problem.start(poses, places)
-    calibrated = problem.minimise(x, CALIBRATED_M)
-    freed = problem.minimise(calibrated[0], BIASED_M)
-    biased = biased or calibrated[1] - freed[1] > DECIDED + 3.0 * len(problem.slots)
-    return problem.solution(*(freed if biased else calibrated), BIASED_M if biased else CALIBRATED_M, biased)
+    groups = tuple(group for group in problem.groups if getattr(known or Found(), group))
+    first = problem.freed(groups).minimise(*problem.split(problem.start(poses, places)))
+    _, best = fewest_open(groups, first, problem.groups, lambda groups, before: before.freed(groups))
+    return best.solution()
+
+
+def _by_the_radio(loud: np.ndarray, to: np.ndarray) -> bool:
+    """Whether means (R,) of ranges to places (R,) scatter more than they should wherever the robot is."""
+    return bool(np.all(np.bincount(to, loud) > _RADIO * np.bincount(to)))
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """A problem at its minimum: unknowns and cost."""
+
+    problem: Problem
+    x: np.ndarray
+    cost: float
+
+    @cached_property
+    def cov(self) -> np.ndarray:
+        """Square covariance of the last pose, the places and what is off, while the first pose is held."""
+        p = self.problem
+        fill, columns = p.rows(self.x[:3], _STAGES[-1]), np.arange(3 * p.count - 3, p.size)
+        return covariance(fill, p.risen(self.x), p.rank, columns)
+
+    @property
+    def off(self) -> Off:
+        """What ranges are off by."""
+        return self.problem.split(self.x)[2]
+
+    @property
+    def off_sigma(self) -> Off:
+        """How well that is known."""
+        tail = self.problem.size - self.problem.first_bias
+        return self.problem.off(np.sqrt(np.maximum(np.diag(self.cov)[-tail:], 0.0)))
+
+    def freed(self, groups: tuple[str, ...]) -> _Solved:
+        """Solved with other groups of unknowns left open."""
+        poses, places, off = self.problem.split(self.x)
+        return self.problem.freed(groups).minimise(poses, places, off)
+
+    def solution(self) -> Solution:
+        """What it tells."""
+        p, free = self.problem, 3 + 2 * len(self.problem.nodes)
+        poses, beacons, off = p.split(self.x)
+        told = p.found(off), p.found(self.off_sigma), p.freedom
+        return Solution(poses, p.nodes, beacons, *told, self.cost, self.cov[:free, :free])
 
 
 @dataclass(frozen=True)
@@ -111,7 +162,7 @@ class Problem(PoseGraph):
         to = number[which]
         means, to = means[to >= 0], to[to >= 0]
         slot, loud = means["slot"], means["loud"]
-        sigma = widened(means["sigma"], loud, to)
+        sigma = means["sigma"] if _by_the_radio(loud, to) else widened(means["sigma"], loud, to)
         pairs = []
         for (a, b), kept in graph.ranges.pairs.items():
             if a in index and b in index and len(kept) >= 3:
@@ -127,32 +178,22 @@ class Problem(PoseGraph):
             ranges=ranges,
             pairs=Pairs.of(pairs),
             steady=even_drive(graph),
+            open=np.array([k for k, slot in enumerate(slots) if slot and not host.surveyed[slot]], int),
             nodes=nodes,
             slots=slots,
         )
 
     def start(self, poses: np.ndarray, places: dict[Node, np.ndarray]) -> np.ndarray:
-        """Unknowns to start from: poses (N, 3), places of the nodes and others."""
+        """Unknowns to start from: poses (N, 3), places of the nodes, nothing off."""
         return self.joined(poses, np.array([places[node] for node in self.nodes]))
 
-    def minimise(self, x: np.ndarray, bias_sigma: float) -> tuple[np.ndarray, float]:
-        """Levenberg-Marquardt from x: unknowns and cost."""
-        return self.descend(x, bias_sigma, _STAGES, moves=_MOVES, enough=_ENOUGH)
+    def minimise(self, poses: np.ndarray, places: np.ndarray, off: Off | None = None) -> _Solved:
+        """Levenberg-Marquardt from poses (N, 3), places (B, 2) and what is off."""
+        x = self.risen(self.joined(poses, places, off))
+        return _Solved(self, *self.descend(x, _STAGES, moves=_MOVES, enough=_ENOUGH))
 
-    def solution(self, x: np.ndarray, cost: float, bias_sigma: float, biased: bool) -> Solution:
-        """What unknowns at their minimum tell."""
-        last = 3 * self.count - 3
-        cov = covariance(self.rows(x[:3], bias_sigma, _STAGES[-1]), x, self.rank, np.arange(last, self.size))
-        free = self.first_bias - last
-        spread = np.sqrt(np.maximum(np.diag(cov)[free:], 0.0))
-        poses, beacons, bias = self.split(x)
-        return Solution(
-            poses,
-            self.nodes,
-            beacons,
-            dict(zip(self.slots, map(float, bias), strict=True)),
-            dict(zip(self.slots, map(float, spread), strict=True)),
-            biased,
-            cost,
-            cov[:free, :free],
-        )
+    def found(self, off: Off) -> Found:
+        """By slot."""
+        bias = dict(zip(self.slots, map(float, off.bias), strict=True))
+        open_slots = [(k, self.slots[k]) for k in self.open] if self.freedom.height else []
+        return Found(bias, {slot: float(off.height[k]) for k, slot in open_slots}, float(off.scale))

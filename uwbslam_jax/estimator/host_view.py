@@ -15,7 +15,7 @@ from uwbslam_jax.mapping import Tiles
 from uwbslam_jax.measurements import StampedFrame
 from uwbslam_jax.numerics import carried_along
 from uwbslam_jax.result import EventKind, RunStatus
-from uwbslam_jax.settings import Config, HostParams, Params
+from uwbslam_jax.settings import Config, Found, HostParams, Params
 
 
 class HostView(NamedTuple):
@@ -28,7 +28,7 @@ class HostView(NamedTuple):
       seen: the newest frames with their estimates, at least one.
       poses: (T, 3) published so far [m, m, rad].
       beacons: slot -> place (2,) [m] and covariance (2, 2) [m^2] when it was last in the state.
-      bias: slot -> range bias that was found beyond the configured one [m].
+      found: what ranges were found to be off by.
     """
 
     config: Config
@@ -40,7 +40,7 @@ class HostView(NamedTuple):
     seen: Sequence[tuple[StampedFrame, Estimate]]
     poses: np.ndarray
     beacons: Mapping[int, tuple[np.ndarray, np.ndarray]]
-    bias: Mapping[int, float]
+    found: Found
 
     @property
     def now(self) -> int:
@@ -86,7 +86,7 @@ class Changes(NamedTuple):
     """What a look changes; what is None stays.
 
     Attributes:
-      state, tiles, bias, status: in place of those of the view. hypotheses: explanations of the start that are alive.
+      state, tiles, found, status: in place of those of the view. hypotheses: explanations of the start that are alive.
       moved: how what the map was drawn from has moved.
       frame_slots: of the two beacons that make the published frame, once that is decided: the track so far is then
         published anew.
@@ -97,7 +97,7 @@ class Changes(NamedTuple):
 
     state: State | None = None
     tiles: Tiles | None = None
-    bias: dict[int, float] | None = None
+    found: Found | None = None
     status: RunStatus | None = None
     hypotheses: int | None = None
     moved: Moved | None = None

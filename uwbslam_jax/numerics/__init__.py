@@ -1,6 +1,12 @@
 """Mathematics that knows no robot."""
 
 from uwbslam_jax.numerics import gaussian as gaussian
+from uwbslam_jax.numerics.freedom import (
+    HEIGHT_START_M as HEIGHT_START_M,
+    Freedom as Freedom,
+    Off as Off,
+    fewest_open as fewest_open,
+)
 from uwbslam_jax.numerics.gaussian import (
     Gaussian as Gaussian,
     inverse3 as inverse3,

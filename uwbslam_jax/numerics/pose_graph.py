@@ -1,4 +1,4 @@
-"""A track of poses, places at rest and biases of ranges as one least-squares problem: its rows and its minimum.
+"""A track of poses, places at rest and what ranges are off by as one least-squares problem: its rows and its minimum.
 
 Start-up solves it for what it remembers, the back end for the whole run.
 """
@@ -6,12 +6,13 @@ Start-up solves it for what it remembers, the back end for the whole run.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
+from uwbslam_jax.numerics.freedom import HEIGHT_START_M, Freedom, Off
 from uwbslam_jax.numerics.robust import soften
 from uwbslam_jax.numerics.se2_host import between, transformed, wrapped
 from uwbslam_jax.numerics.sparse_least_squares import Sink, blocks, elimination, minimise
@@ -26,6 +27,7 @@ class Edges(NamedTuple):
     Attributes:
       old, new: (E,) numbers of the poses. between: (E, 3) pose of the new one in the frame of the old one.
       roots: (E, 3, 3) of their information, of which each is root.T @ root. soft: (E,) whether one may be an outlier.
+      rolled: (E,) whether wheels have measured it.
     """
 
     old: np.ndarray
@@ -33,6 +35,7 @@ class Edges(NamedTuple):
     between: np.ndarray
     roots: np.ndarray
     soft: np.ndarray
+    rolled: np.ndarray
 
 
 class TrackRanges(NamedTuple):
@@ -80,6 +83,11 @@ class Pairs(NamedTuple):
     rise: np.ndarray
     sigma: np.ndarray
 
+    @property
+    def flat(self) -> np.ndarray:
+        """(P,) distance in the plane, at least 0.1 [m]."""
+        return np.sqrt(np.maximum(self.distance**2 - self.rise**2, 0.01))
+
     @staticmethod
     def of(rows: list[tuple[int, int, float, float, float]]) -> Pairs:
         """Rows of two places, range, difference of the heights and standard deviation."""
@@ -99,12 +107,17 @@ class Stage(NamedTuple):
     coarse: float
 
 
+AnyGraph = TypeVar("AnyGraph", bound="PoseGraph")
+
+
 @dataclass(frozen=True)
 class PoseGraph:
-    """The problem in arrays. Unknowns: count poses, a place for each of slots, a bias of the robot and of each node.
+    """The problem in arrays. Unknowns: count poses, B places, a bias of the robot and of each node, then the heights,
+    scales that `freedom` leaves open.
 
     Attributes:
-      count: of the poses. bias_of: (B,) number of each place's bias; 0 is the robot's.
+      count: of the poses. bias_of: (B,) number of each place's node; 0 is the robot's.
+      open: (H,) numbers of the nodes whose height nobody has measured. freedom: see there.
       steady: (T, 5) middle one of three poses between which the velocity changes little, time before and after it [s],
         turn on the way [rad], standard deviation of that change [m/s].
     """
@@ -115,6 +128,20 @@ class PoseGraph:
     ranges: TrackRanges
     pairs: Pairs
     steady: np.ndarray = field(kw_only=True, default_factory=lambda: np.zeros((0, 5)))
+    open: np.ndarray = field(kw_only=True, default_factory=lambda: np.zeros(0, int))
+    freedom: Freedom = field(kw_only=True, default_factory=Freedom)
+
+    def freed(self: AnyGraph, groups: tuple[str, ...]) -> AnyGraph:
+        """The problem with some groups of unknowns left open."""
+        told = {"height": len(self.open) > 0, "wheels": self.edges.rolled.any(), "lidar": not self.edges.rolled.all()}
+        closed = {name: 0.0 for name, any_of_it in told.items() if not any_of_it}
+        return replace(self, freedom=Freedom.of(groups)._replace(**closed))
+
+    @property
+    def groups(self) -> dict[str, int]:
+        """Unknowns of each group that may be left open."""
+        every = {"height": len(self.open), "scale": 1, "bias": self.first_height - self.first_bias}
+        return {group: count for group, count in every.items() if count}
 
     @property
     def first_bias(self) -> int:
@@ -122,9 +149,30 @@ class PoseGraph:
         return 3 * self.count + 2 * len(self.bias_of)
 
     @cached_property
+    def first_height(self) -> int:
+        """Column after the last bias."""
+        return self.first_bias + 1 + int(self.bias_of.max())
+
+    @cached_property
+    def _heights(self) -> int:
+        return len(self.open) if self.freedom.height else 0
+
+    @cached_property
     def size(self) -> int:
         """Unknowns."""
-        return self.first_bias + 1 + int(self.bias_of.max())
+        return self.first_height + self._heights + len(self._scales)
+
+    @cached_property
+    def _scales(self) -> list[str]:
+        """Which of the last fields of Freedom and Off are unknowns, in the order of their columns."""
+        return [name for name in ("scale", "wheels", "lidar") if getattr(self.freedom, name)]
+
+    @cached_property
+    def spread(self) -> np.ndarray:
+        """(size - first_bias,) standard deviations of the priors from the robot's bias on."""
+        f = self.freedom
+        spread = np.repeat([f.bias, f.height], [self.first_height - self.first_bias, self._heights])
+        return np.append(spread, [getattr(f, name) for name in self._scales])
 
     @cached_property
     def rank(self) -> np.ndarray:
@@ -136,53 +184,87 @@ class PoseGraph:
         poses = 3 * elimination(i, j, self.count)[:, None] + np.arange(3)
         return np.append(poses.ravel(), np.arange(3 * self.count, self.size))
 
-    def split(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Poses (count, 3), places (B, 2) and biases of unknowns."""
+    def split(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, Off]:
+        """Poses (count, 3), places (B, 2) and what is off of unknowns."""
         n, m = 3 * self.count, self.first_bias
-        return x[:n].reshape(-1, 3), x[n:m].reshape(-1, 2), x[m:]
+        return x[:n].reshape(-1, 3), x[n:m].reshape(-1, 2), self.off(x[m:])
 
-    def joined(self, poses: np.ndarray, places: np.ndarray) -> np.ndarray:
-        """Unknowns of poses and places, without biases."""
-        return np.concatenate([poses.ravel(), places.ravel(), np.zeros(self.size - self.first_bias)])
+    def off(self, tail: np.ndarray) -> Off:
+        """What the unknowns from the robot's bias on (size - first_bias,) stand for; what is none is 0."""
+        k = self.first_height - self.first_bias
+        height = np.zeros(k)
+        if self._heights:
+            height[self.open] = tail[k : k + self._heights]
+        return Off(tail[:k], height, **dict(zip(self._scales, tail[k + self._heights :].tolist(), strict=True)))
+
+    def joined(self, poses: np.ndarray, places: np.ndarray, off: Off | None = None) -> np.ndarray:
+        """Unknowns of poses, places and what is off, nothing where that is not given."""
+        k = self.first_height - self.first_bias
+        off = off or Off(np.zeros(k), np.zeros(k))
+        heights, scales = off.height[self.open][: self._heights], [getattr(off, name) for name in self._scales]
+        return np.concatenate([poses.ravel(), places.ravel(), off.bias, heights, scales])
+
+    def risen(self, x: np.ndarray) -> np.ndarray:
+        """Unknowns with no height less than HEIGHT_START_M, to start from and for the covariance: at none, a range does
+        not change with it."""
+        x, at = x.copy(), slice(self.first_height, self.first_height + self._heights)
+        x[at] = np.maximum(np.abs(x[at]), HEIGHT_START_M)
+        return x
 
     def bias_column(self, places: np.ndarray) -> np.ndarray:
         """Columns of the biases of places (n,)."""
         return self.first_bias + self.bias_of[places]
 
-    def descend(
-        self, x: np.ndarray, bias_sigma: float, stages: tuple[Stage, ...], **effort: Any
-    ) -> tuple[np.ndarray, float]:
+    def _height_parts(self, places: np.ndarray, slope: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """What rows depend on by the heights of places (n,), where these are unknowns. slope: (n,)."""
+        if not self._heights:
+            return []
+        number = np.full(self.first_height - self.first_bias, -1)
+        number[self.open] = np.arange(self._heights)
+        of = number[self.bias_of[places]]
+        return [(self.first_height + np.maximum(of, 0), np.where(of >= 0, slope, 0.0))]
+
+    def _scale_parts(self, name: str, slope: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """What rows depend on by a scale, where that is an unknown. name: in Freedom; slope: (n, ...)."""
+        if name not in self._scales:
+            return []
+        return [(np.full(len(slope), self.first_height + self._heights + self._scales.index(name)), slope)]
+
+    def descend(self, x: np.ndarray, stages: tuple[Stage, ...], **effort: Any) -> tuple[np.ndarray, float]:
         """Unknowns and cost after one stage after the other, from x whose first pose is held.
 
         Args:
-          bias_sigma: prior spread of each bias [m]. effort: moves, enough, damping, see `minimise`.
+          effort: moves, enough, damping, see `minimise`.
         """
         held, cost = x[:3].copy(), np.inf
         for stage in stages:
-            x, cost = minimise(self.rows(held, bias_sigma, stage), x, self.rank, **effort)
+            x, cost = minimise(self.rows(held, stage), x, self.rank, **effort)
         return x, cost
 
-    def rows(self, held: np.ndarray, bias_sigma: float, stage: Stage) -> Callable[[np.ndarray, Sink], None]:
-        """What puts whitened rows of held start, edges, steady velocity, ranges, pairs and biases into a sink."""
+    def rows(self, held: np.ndarray, stage: Stage) -> Callable[[np.ndarray, Sink], None]:
+        """What puts whitened rows of held start, edges, steady velocity, ranges, pairs and priors into a sink."""
 
         def fill(x: np.ndarray, rows: Sink) -> None:
-            poses, _, bias = self.split(x)
+            poses = self.split(x)[0]
             rows.add((x[:3] - held) / _HELD, [(np.arange(3), np.full(3, 1 / _HELD))])
             for part in blocks(len(self.edges.old)):
-                self._add_edges(rows, poses, stage.soft, part)
+                self._add_edges(rows, x, stage.soft, part)
             self._add_steady(rows, poses)
             for part in blocks(len(self.ranges.at)):
                 self._add_ranges(rows, x, stage.coarse, part)
             self.add_pairs(rows, x, stage.coarse)
-            rows.add(bias / bias_sigma, [(np.arange(self.first_bias, len(x)), np.full(len(bias), 1 / bias_sigma))])
+            tail = x[self.first_bias :]
+            rows.add(tail / self.spread, [(np.arange(self.first_bias, len(x)), 1 / self.spread)])
 
         return fill
 
-    def _add_edges(self, rows: Sink, poses: np.ndarray, soft: float, part: slice) -> None:
-        old, new, measured, roots, may_err = (column[part] for column in self.edges)
+    def _add_edges(self, rows: Sink, x: np.ndarray, soft: float, part: slice) -> None:
+        poses, _, off = self.split(x)
+        old, new, measured, roots, may_err, rolled = (column[part] for column in self.edges)
         a, b = poses[old], poses[new]
         moved = between(a, b)
-        e = moved - measured
+        way = measured * np.array([1.0, 1.0, 0.0])
+        e = moved - (measured + np.where(rolled, off.wheels, off.lidar)[:, None] * way)
         e[:, 2] = wrapped(e[:, 2])
         c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
         zero, one = np.zeros_like(c), np.ones_like(c)
@@ -200,6 +282,10 @@ class PoseGraph:
         inside = np.where(may_err, 1.0 + np.sum(white**2, axis=1) / soft**2, 1.0)
         scaled = roots * inside[:, None, None] ** -1.5
         columns = [3 * old, 3 * old + 1, 3 * old + 2, 3 * new, 3 * new + 1, 3 * new + 2]
+        for name, told in (("wheels", rolled), ("lidar", ~rolled)):
+            for column, slope in self._scale_parts(name, -way * told[:, None]):
+                by.append(slope)
+                columns.append(column)
         parts = [(column, np.einsum("eij,ej->ei", scaled, d)) for column, d in zip(columns, by, strict=True)]
         for k in range(3):
             rows.add(white[:, k] / np.sqrt(inside), [(column, d[:, k]) for column, d in parts])
@@ -223,37 +309,43 @@ class PoseGraph:
             rows.add(r, parts)
 
     def _add_ranges(self, rows: Sink, x: np.ndarray, coarse: float, part: slice) -> None:
-        poses, places, bias = self.split(x)
+        poses, places, off = self.split(x)
         some, n = self.ranges.some(part), 3 * self.count
         ends = some.ends(poses)
         u = (1 - some.share)[:, None] * ends[0] + some.share[:, None] * ends[1] - places[some.to]
-        d = np.maximum(np.sqrt((u**2).sum(1) + some.rise**2), 1e-6)
+        rise = some.rise - off.height[self.bias_of[some.to]]
+        d = np.maximum(np.sqrt((u**2).sum(1) + rise**2), 1e-6)
         column, sigma = self.bias_column(some.to), coarse * some.sigma
-        r, scale = soften((d + bias[0] + x[column] - some.distance) / sigma)
+        r, scale = soften(((1.0 + off.scale) * d + off.bias[0] + x[column] - some.distance) / sigma)
         weight = scale / sigma
+        pull = (1.0 + off.scale) * weight
         unit = u / d[:, None]
         parts = []
         for key, end, near in ((some.at, ends[0], 1 - some.share), (some.after, ends[1], some.share)):
             lever = end - poses[key, :2]
-            parts += [(3 * key + axis, near * weight * unit[:, axis]) for axis in range(2)]
-            parts.append((3 * key + 2, near * weight * (unit[:, 1] * lever[:, 0] - unit[:, 0] * lever[:, 1])))
-        parts += [(n + 2 * some.to + axis, -weight * unit[:, axis]) for axis in range(2)]
+            parts += [(3 * key + axis, near * pull * unit[:, axis]) for axis in range(2)]
+            parts.append((3 * key + 2, near * pull * (unit[:, 1] * lever[:, 0] - unit[:, 0] * lever[:, 1])))
+        parts += [(n + 2 * some.to + axis, -pull * unit[:, axis]) for axis in range(2)]
         parts += [(np.full(len(d), self.first_bias), weight), (column, weight)]
+        parts += self._height_parts(some.to, -pull * rise / d) + self._scale_parts("scale", weight * d)
         rows.add(r, parts)
 
     def add_pairs(self, rows: Sink, x: np.ndarray, coarse: float = 1.0) -> None:
         """Rows of the ranges between places; coarse: how many times as much they may err."""
         if not len(self.pairs.ends):
             return
-        (i, j), (_, places, _), n = self.pairs.ends.T, self.split(x[: self.size]), 3 * self.count
+        (i, j), (_, places, off), n = self.pairs.ends.T, self.split(x[: self.size]), 3 * self.count
         sigma = coarse * self.pairs.sigma
         u = places[i] - places[j]
-        d = np.maximum(np.sqrt((u**2).sum(1) + self.pairs.rise**2), 1e-6)
+        rise = self.pairs.rise + off.height[self.bias_of[i]] - off.height[self.bias_of[j]]
+        d = np.maximum(np.sqrt((u**2).sum(1) + rise**2), 1e-6)
         first, second = self.bias_column(i), self.bias_column(j)
-        r, scale = soften((d + x[first] + x[second] - self.pairs.distance) / sigma)
+        r, scale = soften(((1.0 + off.scale) * d + x[first] + x[second] - self.pairs.distance) / sigma)
         weight = scale / sigma
+        slope = (1.0 + off.scale) * weight
         parts = []
         for axis in range(2):
-            pull = weight * u[:, axis] / d
+            pull = slope * u[:, axis] / d
             parts += [(n + 2 * i + axis, pull), (n + 2 * j + axis, -pull)]
-        rows.add(r, [*parts, (first, weight), (second, weight)])
+        parts += self._height_parts(i, slope * rise / d) + self._height_parts(j, -slope * rise / d)
+        rows.add(r, [*parts, (first, weight), (second, weight), *self._scale_parts("scale", weight * d)])

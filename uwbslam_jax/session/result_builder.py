@@ -142,7 +142,7 @@ def _unplaced(session: Session, facts: Facts) -> list[str]:
 
 def _biases(session: Session) -> list[str]:
     """A warning where notable biases were found that nobody configured."""
-    found = {session.ids[slot]: bias for slot, bias in session.found_bias.items()}
+    found = {session.ids[slot]: bias for slot, bias in session.found.bias.items()}
     told = ", ".join(f"node {node} {bias:+.2f} m" for node, bias in sorted(found.items()))
     advice = "set uwb.bias if the radios are known"
     return [f"ranges are biased: {told} were solved from the run; {advice}"] if session.biased else []
@@ -270,7 +270,7 @@ def _summary(session: Session, facts: Facts) -> dict[str, Any]:
         "events": [[round((e.stamp - int(stamps[0])) / 1e9, 3), e.text] for e in history.events],
         "ranges_used": used,
         "ranges_rejected": rejected,
-        "found_bias": {str(ids[slot]): bias for slot, bias in sorted(session.found_bias.items())},
+        "found_bias": {str(ids[slot]): bias for slot, bias in sorted(session.found.bias.items())},
         "dropped": dict(sorted(facts.dropped.items())),
         "truncated": facts.truncated,
         "warnings": facts.warnings,

@@ -23,9 +23,9 @@ from uwbslam_jax.estimator import State, init
 from uwbslam_jax.mapping import Tiles
 from uwbslam_jax.measurements import RangeMessage
 from uwbslam_jax.numerics import Gaussian, locate
-from uwbslam_jax.settings import Settings, make_config, make_host_params, make_params
+from uwbslam_jax.settings import Found, Settings, make_config, make_host_params, make_params
 
-FILE, _VERSION = "state.npz", 1
+FILE, _VERSION = "state.npz", 2
 """Name of a saved state in a run's folder, and of what it holds [number]: another one is refused."""
 _WINDOW_S = 0.5
 """The robot is placed by the ranges of so long a time; it may drive meanwhile."""
@@ -43,13 +43,13 @@ class Saved:
 
     Attributes:
       state: of the estimator, numpy; tiles: of its map.
-      slots: node id -> slot; found_bias: slot -> [m].
+      slots: node id -> slot; found: what ranges were found to be off by.
     """
 
     state: State
     tiles: Tiles
     slots: dict[int, int]
-    found_bias: dict[int, float]
+    found: Found
 
 
 def save(saved: Saved, directory: Path) -> None:
@@ -58,7 +58,9 @@ def save(saved: Saved, directory: Path) -> None:
     arrays = {f"state{name}": leaf for name, leaf in _leaves(saved.state)}
     arrays |= {"tiles": places} | {f"layer{k}": layer for k, layer in enumerate(layers)}
     about = {"version": _VERSION, "resolution": saved.tiles.resolution}
-    about |= {"slots": list(saved.slots.items()), "found_bias": list(saved.found_bias.items())}
+    found = saved.found
+    about |= {"slots": list(saved.slots.items()), "found_bias": list(found.bias.items())}
+    about |= {"found_height": list(found.height.items()), "found_scale": found.scale}
     part = directory / f"{FILE}.part"
     with part.open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, about=np.array(json.dumps(about)), **arrays)
@@ -89,8 +91,10 @@ def load(directory: Path, settings: Settings) -> Saved:
         leaves = [arrays[f"state{name}"] for name, _ in _leaves(like)]
         state = jax.tree.unflatten(jax.tree.structure(like), leaves)
         slots = {int(node): int(slot) for node, slot in about["slots"]}
-        found_bias = {int(slot): float(bias) for slot, bias in about["found_bias"]}
-        return Saved(state, tiles, slots, found_bias)
+        bias, height = (
+            {int(slot): float(value) for slot, value in about[name]} for name in ("found_bias", "found_height")
+        )
+        return Saved(state, tiles, slots, Found(bias, height, float(about["found_scale"])))
     except OSError as error:
         raise RunError(f"{path}: {error.strerror or error}") from None
     except (KeyError, ValueError, zipfile.BadZipFile, EOFError) as error:
@@ -105,7 +109,7 @@ class Locator:
     """Where a robot is among saved beacons, by its first ranges."""
 
     def __init__(self, saved: Saved, settings: Settings):
-        self._host = make_host_params(settings, make_params(settings, saved.slots, saved.found_bias))
+        self._host = make_host_params(settings, make_params(settings, saved.slots, saved.found), saved.slots)
         self._slots = saved.slots
         self._places = np.asarray(saved.state.belief.mean, float)[: 2 * len(self._host.bias)].reshape(-1, 2)
         self._known = np.asarray(saved.state.active) & ~np.asarray(saved.state.moving)

@@ -25,7 +25,16 @@ from uwbslam_jax.session.history import History
 from uwbslam_jax.session.odometry_monitor import OdometryMonitor
 from uwbslam_jax.session.saved_state import Saved
 from uwbslam_jax.session.update import Update
-from uwbslam_jax.settings import HostParams, Params, Settings, make_config, make_host_params, make_params, with_room
+from uwbslam_jax.settings import (
+    Found,
+    HostParams,
+    Params,
+    Settings,
+    make_config,
+    make_host_params,
+    make_params,
+    with_room,
+)
 from uwbslam_jax.startup import StartUp
 
 CONTROL_EVERY = compiled.GROUP
@@ -43,7 +52,7 @@ class Session:
       state, tiles: the estimator's, and what of its map lies outside the window.
       decided_at: stamp of the frame at which the published frame was decided, None before [ns].
       status: of the start-up. hypotheses: explanations of the start that are alive.
-      found_bias: slot -> range bias that was found beyond the configured one [m]; empty where there is none.
+      found: what ranges were found to be off by.
       history: what was reported so far. back_end: what the run as a whole is solved by.
       listener: called with each update when stepped frame by frame, before the host has its look.
       odometry: whether it tells of the motion that the scans show.
@@ -61,14 +70,14 @@ class Session:
         self.decided_at: int | None = None
         self.status = RunStatus.LIDAR_ONLY if settings.filter.lidar_only else RunStatus.WAITING
         self.hypotheses = 0
-        self.found_bias: dict[int, float] = {}
+        self.found = Found()
         self.listener: Callable[[Update], object] | None = None
         self.fixed = False
         self._slots: dict[int, int] = {settings.robot.id: 0}
         self.odometry = OdometryMonitor()
         self._pending: list[tuple[StampedFrame, Estimate]] = []
         self._measured: list[Odometry] = []
-        self._on_host: tuple[Params | None, HostParams] = (None, make_host_params(settings, self.params))
+        self._on_host: tuple[Params | None, HostParams] = (None, make_host_params(settings, self.params, self._slots))
         self._start_up = StartUp(self.host)
         self._keeper = BeaconKeeper()
         self.back_end = BackEnd(settings)
@@ -77,7 +86,7 @@ class Session:
     def host(self) -> HostParams:
         """The parameters that are in use now, on the host."""
         if self._on_host[0] is not self.params:
-            self._on_host = (self.params, make_host_params(self.settings, self.params))
+            self._on_host = (self.params, make_host_params(self.settings, self.params, self._slots))
         return self._on_host[1]
 
     @property
@@ -103,7 +112,7 @@ class Session:
     @property
     def biased(self) -> bool:
         """Whether a bias was found that is worth reporting."""
-        return notable(self.found_bias, self.settings.uwb.sigma_n)
+        return notable(self.found.bias, self.settings.uwb.sigma_n)
 
     @property
     def lack(self) -> Lack:
@@ -158,7 +167,7 @@ class Session:
         if self.fixed or not known:
             return None
         state = jax.tree.map(lambda leaf: np.array(leaf, copy=True), self.state)
-        return Saved(state, self.tiles.copy(), dict(self._slots), dict(self.found_bias))
+        return Saved(state, self.tiles.copy(), dict(self._slots), self.found)
 
     def go_on(self, saved: Saved, place: np.ndarray, stamp: int, *, fixed: bool) -> None:
         """Start from what an earlier run has found, in place of start-up.
@@ -169,10 +178,10 @@ class Session:
         """
         self.state = saved_state.resumed(saved, place, fixed=fixed)
         self.tiles, self._slots = saved.tiles.copy(), dict(saved.slots)
-        self.found_bias, self.fixed = dict(saved.found_bias), fixed
+        self.found, self.fixed = saved.found, fixed
         self.history.event(stamp, EventKind.LOCALISING if fixed else EventKind.RESUMED)
         self.config = dataclasses.replace(make_config(self.settings), draws=not fixed)
-        self.params = make_params(self.settings, self._slots, self.found_bias)
+        self.params = make_params(self.settings, self._slots, self.found)
         self.decided_at, self.status, self.hypotheses = stamp, RunStatus.DECIDED, 1
         self.back_end.enabled = False  # the scans that the saved map was drawn from are gone
         for slot in np.flatnonzero(np.asarray(self.state.active))[1:]:
@@ -191,7 +200,7 @@ class Session:
             self._make_room(len(frame.slots))
         if len(frame.slots) > len(self._slots):
             self._slots = dict(frame.slots)
-            self.params = make_params(self.settings, self._slots, self.found_bias)
+            self.params = make_params(self.settings, self._slots, self.found)
         self._measured.append(frame.frame.odometry)
         if self.odometry.trusted:
             return frame
@@ -219,7 +228,7 @@ class Session:
         """The run as its parts see it."""
         history = self.history
         shown = self.config, self.params, self.host, self.state, self.tiles, self._slots, seen
-        return HostView(*shown, history.poses.values, history.beacons, self.found_bias)
+        return HostView(*shown, history.poses.values, history.beacons, self.found)
 
     def _look(self) -> None:
         seen, self._pending = self._pending, []
@@ -247,9 +256,9 @@ class Session:
             self.state = changes.state
         if changes.tiles is not None:
             self.tiles = changes.tiles
-        if changes.bias is not None:
-            self.found_bias = changes.bias
-            self.params = make_params(self.settings, self._slots, self.found_bias)
+        if changes.found is not None:
+            self.found = changes.found
+            self.params = make_params(self.settings, self._slots, self.found)
         if changes.status is not None and changes.hypotheses is not None:
             self.status, self.hypotheses = changes.status, changes.hypotheses
         if changes.moved is not None:

@@ -269,6 +269,14 @@ def _lever_arms(seed: int, duration: float | None) -> Scenario:
     return replace(made, lidar=Lidar(pose=(0.3, 0.0, np.deg2rad(10.0))), uwb=Uwb(antenna=(0.0, 0.2, 0.6)))
 
 
+def _heights(seed: int, duration: float | None, *, beacon_pairs: bool = True) -> Scenario:
+    """Beacons 0.3 to 3 m above the robot's antenna, and nobody has measured how much."""
+    made = _hall(seed, duration)
+    heights = stream(seed, "heights").uniform(0.3, 3.0, len(made.beacons))
+    beacons = (replace(b, height=float(h), surveyed=False) for b, h in zip(made.beacons, heights, strict=True))
+    return replace(made, beacons=tuple(beacons), uwb=Uwb(beacon_pairs=beacon_pairs))
+
+
 def _biased(seed: int, duration: float | None) -> Scenario:
     """Each node's antenna delay is off by 0.15 m rms, and nobody has calibrated it."""
     made = _hall(seed, duration)
@@ -317,6 +325,9 @@ _MAKERS: dict[str, Callable[[int, float | None], Scenario]] = {
     "sparse": _sparse,
     "lever_arms": _lever_arms,
     "biased": _biased,
+    "heights": _heights,
+    "heights_robot_only": lambda seed, duration: _heights(seed, duration, beacon_pairs=False),
+    "scale": lambda seed, duration: replace(_hall(seed, duration), uwb=Uwb(scale=0.07)),
     "office": _office,
 }
 """What makes a scenario of a seed and a duration, its own where None [name -> function]."""

@@ -50,7 +50,7 @@ class Beacon:
     Attributes:
       id: node id.
       position: where it stands at first, x, y [m].
-      height: of its antenna above the floor [m].
+      height: of its antenna above the floor [m]. surveyed: whether somebody has measured that.
       alive: when it is switched on.
       moves: when it is carried, in order of time.
     """
@@ -58,6 +58,7 @@ class Beacon:
     id: int
     position: tuple[float, float]
     height: float = 0.0
+    surveyed: bool = True
     alive: tuple[Interval, ...] = ((0.0, INF),)
     moves: tuple[Follow | Walk, ...] = ()
 
@@ -113,6 +114,7 @@ class Uwb:
       beacon_pairs: whether beacons range to each other.
       reach: pairs farther apart do not hear each other [m].
       bias: range bias of a node by id [m]; a pair's is the sum of both.
+      scale: excess of every range in proportion to the distance [m/m].
       report_powers: powers are NaN otherwise.
       nlos: whether a wall in between lengthens a range; walls are transparent otherwise.
       nlos_bias: mean of that exponential excess [m].
@@ -133,6 +135,7 @@ class Uwb:
     beacon_pairs: bool = True
     reach: float = INF
     bias: dict[int, float] = field(default_factory=dict)
+    scale: float = 0.0
     report_powers: bool = True
     nlos: bool = False
     nlos_bias: float = 0.8
@@ -175,7 +178,7 @@ def stream(seed: int, purpose: str) -> np.random.Generator:
 
 
 def settings_overrides(scenario: Scenario) -> dict[str, Any]:
-    """What a user would configure for this robot: lever arms and heights; never what is to be found out."""
+    """What a user would configure for this robot: lever arms and surveyed heights; never what is to be found out."""
     antenna, lidar = (tuple(float(x) for x in pose) for pose in (scenario.uwb.antenna, scenario.lidar.pose))
-    heights = {str(b.id): float(b.height) for b in scenario.beacons if b.height != antenna[2]}
+    heights = {str(b.id): float(b.height) for b in scenario.beacons if b.surveyed and b.height != antenna[2]}
     return {"robot": {"id": scenario.uwb.robot_id, "antenna": antenna, "lidar": lidar}, "uwb": {"height": heights}}

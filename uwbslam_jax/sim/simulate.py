@@ -173,7 +173,8 @@ def _ranges(scenario: Scenario) -> Iterator[Logged]:
         a, b = nodes[left, np.arange(t.size)], nodes[right, np.arange(t.size)]
         distance = np.sqrt(np.sum((a - b) ** 2, -1))
         wall = blocked(scenario.world.segments, a[:, :2], b[:, :2]) if uwb.nlos else np.zeros(t.size, bool)
-        measured = _rounded(distance + _range_errors(uwb, draws, ids[left], ids[right], t, wall), uwb.quantum)
+        exact = (1.0 + uwb.scale) * distance
+        measured = _rounded(exact + _range_errors(uwb, draws, ids[left], ids[right], t, wall), uwb.quantum)
         receive, first_path = _powers(uwb, draws, distance, wall)
         on = np.array([np.ones(t.size, bool), *(_during(b.alive, t) for b in scenario.beacons)])
         on = on[left, np.arange(t.size)] & on[right, np.arange(t.size)]

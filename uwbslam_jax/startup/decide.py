@@ -13,17 +13,16 @@ from functools import partial
 import numpy as np
 
 from uwbslam_jax.estimator import published
-from uwbslam_jax.numerics import CALIBRATED_M, DECIDED, SIGMA_ENOUGH_M, largest_sigma, numeric_jacobian
+from uwbslam_jax.numerics import DECIDED, SIGMA_ENOUGH_M, fewest_open, largest_sigma, numeric_jacobian
 from uwbslam_jax.reasons import Lack, StartUpLacks
 from uwbslam_jax.result import RunStatus
+from uwbslam_jax.settings import Found
 from uwbslam_jax.startup.hypotheses import explanations
 from uwbslam_jax.startup.keyframe_buffer import Buffer
 from uwbslam_jax.startup.placement import Placement, Problem
 
 _MOVED_ENOUGH_M = 1.0
 """A robot that has not moved so far is waited for: over less, the noise of the ranges hides the directions [m]."""
-_BIAS_M = 0.3
-"""Prior spread of a node's range bias once ranges do not look calibrated [m]."""
 _HEADING_ENOUGH = 0.026
 """Start-up ends when the robot's heading among the beacons is known this well [rad]."""
 _UNDRAWN_HEADING, _UNDRAWN_SIGMA = 0.15, 0.05
@@ -44,8 +43,7 @@ class Outcome:
       margin: difference of log-likelihood between the two reflections.
       placement: the decided one, else None.
       lack: what is waited for, None where there is a placement.
-      biased: whether the ranges are explained far better with a bias of each node; a placement
-        then has them.
+      open: what ranges are explained far better with: "bias", "height", "scale"; a placement then has them.
     """
 
     status: RunStatus
@@ -53,7 +51,16 @@ class Outcome:
     margin: float
     placement: Placement | None
     lack: Lack | None = None
-    biased: bool = False
+    open: tuple[str, ...] = ()
+
+    def found(self) -> Found | None:
+        """What a placement's ranges are off by, None where they are as configured."""
+        if self.placement is None or not self.open:
+            return None
+        off, slots = self.placement.off, [0, *self.placement.slots]
+        bias = dict(zip(slots, map(float, off.bias), strict=True)) if "bias" in self.open else {}
+        height = {slot: float(h) for slot, h in zip(slots, off.height, strict=True) if h}
+        return Found(bias, height, float(off.scale))
 
 
 def solve(buffer: Buffer, ids: dict[int, int]) -> Outcome:
@@ -63,31 +70,34 @@ def solve(buffer: Buffer, ids: dict[int, int]) -> Outcome:
     problem = Problem.build(buffer)
     if problem is None:
         return Outcome(RunStatus.PLACING, 0, 0.0, None, StartUpLacks.RANGES)
-    found, bias_sigma = _explain(problem)
-    best, biased = found[0], bias_sigma > CALIBRATED_M
+    problem, found, opened = _explain(problem)
+    best = found[0]
     margin = found[1].cost - best.cost if len(found) > 1 else float("inf")
     misfit = StartUpLacks.FIT if problem.misfit(best) > _MISFIT else None
     if margin < DECIDED:
         alive = sum(other.cost - best.cost < DECIDED for other in found)
-        return Outcome(RunStatus.UNDECIDED, alive, margin, None, misfit or StartUpLacks.SIDE, biased)
+        return Outcome(RunStatus.UNDECIDED, alive, margin, None, misfit or StartUpLacks.SIDE, opened)
     drawn = any(key.information.any() for key in buffer.keyframes)
-    sure = _keep_certain(problem.keep_unique(best, bias_sigma), ids, drawn=drawn)
+    sure = _keep_certain(problem.keep_unique(best), ids, drawn=drawn)
     waits = not drawn and buffer.newest - buffer.keyframes[0].frame.stamp < _UNDRAWN_WAIT_S * 1e9
     if isinstance(sure, Placement) and waits and len(sure.slots) < len(problem.slots):
         sure = StartUpLacks.MORE
     if isinstance(sure, Lack):
-        return Outcome(RunStatus.PLACING, 1, margin, None, misfit or sure, biased)
-    return Outcome(RunStatus.DECIDED, 1, margin, sure, None, biased)
+        return Outcome(RunStatus.PLACING, 1, margin, None, misfit or sure, opened)
+    return Outcome(RunStatus.DECIDED, 1, margin, sure, None, opened)
 
 
-def _explain(problem: Problem) -> tuple[list[Placement], float]:
-    """Explanations, the best first, with ranges taken as calibrated, or with a bias of each node where that explains
-    them far better; and the spread of the biases that was allowed [m]."""
-    found = explanations(problem, CALIBRATED_M)
-    freed = problem.minimise(found[0].beacons, found[0].poses, _BIAS_M)
-    if found[0].cost - freed.cost < DECIDED + 3.0 * len(freed.bias):
-        return found, CALIBRATED_M
-    return explanations(problem, _BIAS_M), _BIAS_M
+def _explain(problem: Problem) -> tuple[Problem, list[Placement], tuple[str, ...]]:
+    """Explanations, the best first, with ranges taken as they are configured, or with what explains them far better
+    left open; and that."""
+
+    def again(groups: tuple[str, ...], before: Placement) -> Placement:
+        return problem.freed(groups).minimise(before.beacons, before.poses, before.off)
+
+    found = explanations(problem)
+    groups, _ = fewest_open((), found[0], problem.groups, again)
+    freed = problem.freed(groups)
+    return freed, explanations(freed) if groups else found, groups
 
 
 def _keep_certain(placement: Placement, ids: dict[int, int], *, drawn: bool) -> Placement | Lack:

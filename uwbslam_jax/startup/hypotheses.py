@@ -28,7 +28,7 @@ _SAME_M = 0.3
 """Beacons closer than this are the same place."""
 
 
-def explanations(problem: Problem, bias_sigma: float) -> list[Placement]:
+def explanations(problem: Problem) -> list[Placement]:
     """Distinct minima of the batch problem, the best first; see the module's first lines.
 
     Minima are distinct when at least half of their beacons are elsewhere: what only one beacon's side decides is for
@@ -36,10 +36,10 @@ def explanations(problem: Problem, bias_sigma: float) -> list[Placement]:
     """
     starts = [(beacons, problem.track) for beacons in track_sides(problem)]
     starts += laid_on_track(problem)
-    found = [problem.minimise(beacons, poses, bias_sigma) for beacons, poses in starts]
+    found = [problem.minimise(beacons, poses) for beacons, poses in starts]
     best = min(found, key=lambda p: p.cost)
     # every start may have slid into one valley: ask the exact mirror images as well
-    found += [problem.minimise(beacons, poses, bias_sigma) for beacons, poses in problem.images(best)]
+    found += [problem.minimise(beacons, poses) for beacons, poses in problem.images(best)]
     found.sort(key=lambda p: p.cost)
     distinct: list[Placement] = []
     for placement in found:
@@ -99,7 +99,7 @@ def _side_cost(problem: Problem, spots: np.ndarray, misfit: np.ndarray, choices:
         # the track is not exact, and what it errs by is in the places; that two beacons at rest are as far apart as
         # hundreds of ranges say is no outlier
         sigma = np.hypot(problem.pairs.sigma, _SAME_M)
-        cost = cost + (np.abs(apart - problem.pairs.distance) / sigma).sum(1)
+        cost = cost + (np.abs(apart - problem.pairs.flat) / sigma).sum(1)
     return cost
 
 
@@ -126,11 +126,11 @@ def _relative_geometry(problem: Problem) -> np.ndarray | None:
     i, j = problem.pairs.ends.T
     if count < 3 or len(i) < 2 * count - 3 or len(np.union1d(i, j)) < count:
         return None
-    spots = scaled(count, i, j, problem.pairs.distance)
+    spots = scaled(count, i, j, problem.pairs.flat)
     for _ in range(10):
         u = spots[i] - spots[j]
         d = np.maximum(np.linalg.norm(u, axis=1), 1e-6)
-        r, scale = soften((d - problem.pairs.distance) / problem.pairs.sigma)
+        r, scale = soften((d - problem.pairs.flat) / problem.pairs.sigma)
         J = np.zeros((len(d), 2 * count))
         rows = np.arange(len(d))
         for axis in range(2):

@@ -111,7 +111,8 @@ class Buffer:
     """Keyframes and ranges of the start.
 
     Attributes:
-      keyframes: kept so far. sightings: slot -> ranges of the robot to it; pairs: (i, j) -> ranges between beacons.
+      keyframes: kept so far. sightings: slot -> ranges of the robot to it; pairs: (i, j) -> distances of two beacons'
+        antennas in space [m].
       host: what a range is taken for; grows as ids get slots.
       taken: keyframes so far, those that were thinned out since as well.
     """
@@ -188,10 +189,11 @@ class Buffer:
     def _add_range(self, frame: StampedFrame, k: int, pose: np.ndarray, velocity: np.ndarray, yaw_rate: float) -> None:
         r = frame.frame.ranges
         i, j = sorted((int(r.i[k]), int(r.j[k])))
-        flat = float(self.host.flat(float(r.range[k]), i, j))
+        measured = float(r.range[k])
         if i > 0:
-            self.pairs.setdefault((i, j), deque(maxlen=_MOST_OF_PAIR)).append(flat)
+            self.pairs.setdefault((i, j), deque(maxlen=_MOST_OF_PAIR)).append(float(self.host.slant(measured, i, j)))
             return
+        flat = float(self.host.flat(measured, i, j))
         age = float(r.age[k])
         then = pose + age * np.append(velocity, yaw_rate)
         kept = self.sightings.setdefault(j, deque())

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from uwbslam_jax.numerics import (
-    CALIBRATED_M,
     DECIDED,
     Edges,
+    Off,
     Pairs,
     PoseGraph,
     Stage,
@@ -54,7 +54,7 @@ class Placement:
     Attributes:
       poses: (N, 3); slots: placed beacons; beacons: (B, 2) [m]; cost: negative log-likelihood.
       cov: joint covariance of poses and beacons in that order (3 N + 2 B).
-      bias, bias_sigma: (1 + B,) of the robot's node and the beacons' [m].
+      off, off_sigma: what the ranges of the robot's node and the beacons' are off by, and how well that is known.
       drawn: number of the last pose whose scan is in the map, of the last one where there is no scan.
     """
 
@@ -63,8 +63,8 @@ class Placement:
     beacons: np.ndarray
     cost: float
     cov: np.ndarray
-    bias: np.ndarray
-    bias_sigma: np.ndarray
+    off: Off
+    off_sigma: Off
     drawn: int
 
     def beacon_sigma(self) -> np.ndarray:
@@ -78,9 +78,8 @@ class Placement:
         nodes = np.array([0, *[1 + b for b in kept]])
         cov = self.cov[np.ix_(columns, columns)]
         slots = [self.slots[b] for b in kept]
-        return Placement(
-            self.poses, slots, self.beacons[kept], self.cost, cov, self.bias[nodes], self.bias_sigma[nodes], self.drawn
-        )
+        off = [o._replace(bias=o.bias[nodes], height=o.height[nodes]) for o in (self.off, self.off_sigma)]
+        return Placement(self.poses, slots, self.beacons[kept], self.cost, cov, *off, self.drawn)
 
     def columns(self, *poses: int) -> np.ndarray:
         """Of some poses, given by their number, and of the beacons in the covariance."""
@@ -114,7 +113,7 @@ class Problem(PoseGraph):
             return None
         seen = [means._replace(to=np.full(len(means.at), b)) for b, means in enumerate(seen)]
         pairs = [
-            (index[i], index[j], middle, 0.0, sigma)
+            (index[i], index[j], middle, float(buffer.host.rise(i, j)), sigma)
             for (i, j), kept in buffer.pairs.items()
             if i in index and j in index
             for middle, sigma, _ in [median_range(np.array(kept), buffer.host.sigma_n)]
@@ -125,6 +124,7 @@ class Problem(PoseGraph):
             edges=_steps(keys),
             ranges=TrackRanges(*(np.concatenate(column) for column in zip(*seen, strict=True))),
             pairs=Pairs.of(pairs),
+            open=np.array([1 + b for slot, b in index.items() if not buffer.host.surveyed[slot]], int),
             slots=list(index),
             track=np.array([key.pose for key in keys]),
             drawn=max((k for k, key in enumerate(keys) if key.matched), default=len(keys) - 1),
@@ -145,42 +145,43 @@ class Problem(PoseGraph):
             found.append(((placement.beacons - centre) @ turn + centre, poses))
         return found
 
-    def minimise(
-        self, beacons: np.ndarray, poses: np.ndarray | None = None, bias_sigma: float = CALIBRATED_M
-    ) -> Placement:
+    def minimise(self, beacons: np.ndarray, poses: np.ndarray | None = None, off: Off | None = None) -> Placement:
         """Levenberg-Marquardt from given beacons and the track as it was driven; the first pose is held.
 
         Args:
           beacons: (B, 2) [m]. poses: (N, 3) to start from instead of the track.
-          bias_sigma: prior spread of each node's range bias [m].
+          off: what ranges are off by to start from.
         """
-        x = self.joined(self.track if poses is None else poses, beacons)
-        x, cost = self.descend(x, bias_sigma, _STAGES, moves=_MOST_MOVES, enough=_ENOUGH, damping=1e-3)
-        cov = covariance(self.rows(x[:3], bias_sigma, _STAGES[-1]), x, self.rank, np.arange(len(x)))
-        poses, beacons, bias = self.split(x)
+        x = self.risen(self.joined(self.track if poses is None else poses, beacons, off))
+        x, cost = self.descend(x, _STAGES, moves=_MOST_MOVES, enough=_ENOUGH, damping=1e-3)
+        cov = covariance(self.rows(x[:3], _STAGES[-1]), self.risen(x), self.rank, np.arange(len(x)))
+        poses, beacons, off = self.split(x)
         m = self.first_bias
-        sigma = np.sqrt(np.diag(cov)[m:])
-        return Placement(poses, self.slots, beacons, cost, cov[:m, :m], bias, sigma, self.drawn)
+        sigma = self.off(np.sqrt(np.diag(cov)[m:]))
+        return Placement(poses, self.slots, beacons, cost, cov[:m, :m], off, sigma, self.drawn)
 
     def misfit(self, placement: Placement) -> float:
         """Median of how far the robot's ranges are off in a placement, in standard deviations."""
-        apart = np.linalg.norm(self.ranges.antenna(placement.poses) - placement.beacons[self.ranges.to], axis=1)
-        bias = placement.bias[0] + placement.bias[1 + self.ranges.to]
-        return float(np.median(np.abs(apart + bias - self.ranges.distance) / self.ranges.sigma))
+        off, to = placement.off, self.ranges.to
+        apart = np.linalg.norm(self.ranges.antenna(placement.poses) - placement.beacons[to], axis=1)
+        slant = np.hypot(apart, self.ranges.rise - off.height[1 + to])
+        expected = (1.0 + off.scale) * slant + off.bias[0] + off.bias[1 + to]
+        return float(np.median(np.abs(expected - self.ranges.distance) / self.ranges.sigma))
 
-    def keep_unique(self, best: Placement, bias_sigma: float = CALIBRATED_M) -> Placement:
+    def keep_unique(self, best: Placement) -> Placement:
         """The placement without the beacons that have a second place which explains the ranges as well."""
         antenna, sigma = self.ranges.antenna(best.poses), best.beacon_sigma()
-        rows = self.rows(best.poses[0], bias_sigma, _STAGES[-1])
+        rows = self.rows(best.poses[0], _STAGES[-1])
         unique = []
         for b in range(len(self.slots)):
             mine = self.ranges.to == b
-            distance = self.ranges.distance[mine] - best.bias[0] - best.bias[1 + b]
+            slant = (self.ranges.distance[mine] - best.off.bias[0] - best.off.bias[1 + b]) / (1.0 + best.off.scale)
+            distance = np.sqrt(np.maximum(slant**2 - best.off.height[1 + b] ** 2, 0.01))
             spots = np.stack(multilaterate(antenna[mine], distance, self.ranges.sigma[mine]))
             away = spots[np.argmax(np.linalg.norm(spots - best.beacons[b], axis=1))]
             moved = best.beacons.copy()
             moved[b] = away
-            there = cost_of(rows, np.concatenate([best.poses.ravel(), moved.ravel(), best.bias]))
+            there = cost_of(rows, self.joined(best.poses, moved, best.off))
             near = np.linalg.norm(away - best.beacons[b]) < max(4 * sigma[b], 0.3)
             unique.append(near or there - best.cost > DECIDED)
         return best.only([b for b, ok in enumerate(unique) if ok])
@@ -205,7 +206,7 @@ def _steps(keys: list[Keyframe]) -> Edges:
     information = np.array([key.information for key in keys])[new] * told[:, None, None]
     cov = np.linalg.inv(turn @ information @ turn.swapaxes(1, 2) + diagonal(loose**-2))
     roots = np.linalg.cholesky(np.linalg.inv(cov + diagonal(step_sigma(steps, _DRIFT) ** 2))).swapaxes(1, 2)
-    return Edges(old, new, steps, roots, np.zeros(len(new), bool))
+    return Edges(old, new, steps, roots, *np.zeros((2, len(new)), bool))
 
 
 def loose_sigma(steps: np.ndarray, elapsed: np.ndarray, rolled: np.ndarray) -> np.ndarray:

@@ -65,11 +65,9 @@ class StartUp:
             return known
         frame_slots = choose_frame(outcome.placement, ids)
         state, tiles, moved = adopt(view, self._buffer, outcome.placement, frame_slots)
-        bias = None
-        if outcome.biased:
-            bias = dict(zip([0, *outcome.placement.slots], map(float, outcome.placement.bias), strict=True))
+        found = outcome.found()
         events.append(SlotEvent(0, EventKind.FRAME_DECIDED, " and ".join(str(ids[slot]) for slot in frame_slots)))
         events += [SlotEvent(slot, EventKind.PLACED) for slot in outcome.placement.slots]
         left_out = self._buffer.sightings.keys() - set(outcome.placement.slots)
         known = known._replace(heard={slot: self._buffer.heard(slot, moved) for slot in sorted(left_out)})
-        return known._replace(state=state, tiles=tiles, bias=bias, moved=moved, frame_slots=frame_slots)
+        return known._replace(state=state, tiles=tiles, found=found, moved=moved, frame_slots=frame_slots)

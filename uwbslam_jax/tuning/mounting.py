@@ -114,7 +114,7 @@ class Mounting:
         robot's a turn of the frame would turn the residuals, and pass for something that they tell."""
         p = self.problem.edges
         keep = p.soft | ~self._rolled()[p.new]
-        old, new, measured, roots, soft = (column[keep] for column in p)
+        old, new, measured, roots, soft, _ = (column[keep] for column in p)
         columns = [*_columns(3 * old, 3), *_columns(3 * new, 3), *_shared(self.lidar, 3, len(old))]
         own, back = self.host.lidar[None], between(self.host.lidar[None], np.zeros(3))
         motion = compose(compose(back, measured), own)

@@ -1,0 +1,129 @@
+"""What ranges and wheels may be off by from how they are configured, and how much of it a problem should leave open."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple, Protocol, TypeVar
+
+import numpy as np
+
+from uwbslam_jax.numerics.robust import CALIBRATED_M, DECIDED
+
+_PRICE = 3.0
+"""Log-likelihood that each unknown of a group has to gain, besides what decides between two explanations."""
+_SURE = 3.0
+"""So many times its price a group that is needed costs for certain, however far from linear the problem is."""
+HEIGHT_START_M = 0.5
+"""Where an unknown height starts from at least [m]: at none, a range does not change with it."""
+
+
+class Freedom(NamedTuple):
+    """Standard deviations of what may be off from how it is configured; what has 0 is as configured, and no unknown.
+
+    Attributes:
+      bias: of each node's ranges [m]. height: of an antenna that nobody has measured [m].
+      scale: of all ranges in proportion to the distance [m/m].
+      wheels, lidar: of the way that wheels tell, and scans [m/m].
+    """
+
+    bias: float = CALIBRATED_M
+    height: float = 0.0
+    scale: float = 0.0
+    wheels: float = 0.0
+    lidar: float = 0.0
+
+    @staticmethod
+    def of(groups: tuple[str, ...]) -> Freedom:
+        """Some of "bias", "height", "scale" left open; with the scale of ranges what it is measured by."""
+        return Freedom(
+            bias=_OPEN.bias if "bias" in groups else CALIBRATED_M,
+            height=_OPEN.height if "height" in groups else 0.0,
+            scale=_OPEN.scale if "scale" in groups else 0.0,
+            wheels=_OPEN.wheels if "scale" in groups else 0.0,
+            lidar=_OPEN.lidar if "scale" in groups else 0.0,
+        )
+
+
+_OPEN = Freedom(bias=0.3, height=1.0, scale=0.05, wheels=0.02, lidar=0.002)
+"""Of antenna delays [m], of how much higher than the robot's a beacon's antenna stands [m], of the ranges' scale, the
+wheels' and the LiDAR's [m/m]."""
+
+
+class Off(NamedTuple):
+    """By how much it is off, or how well that is known; S nodes, the robot first.
+
+    Attributes:
+      bias, height: (S,) of each node [m]. scale, wheels, lidar: see Freedom [m/m].
+    """
+
+    bias: np.ndarray
+    height: np.ndarray
+    scale: float = 0.0
+    wheels: float = 0.0
+    lidar: float = 0.0
+
+
+    def strength(self, sigma: Off, group: str) -> float:
+        """Log-likelihood that closing a group would cost at least, by how well it is known (Wald's test)."""
+        of_group = [np.atleast_1d(np.abs(getattr(off, group))) for off in (self, sigma)]
+        known = of_group[1] > 0
+        return 0.5 * float(np.max((of_group[0][known] / of_group[1][known]) ** 2, initial=0.0))
+
+
+class Attempt(Protocol):
+    """A problem solved with some groups of unknowns left open.
+
+    Attributes:
+      cost: negative log-likelihood. off, off_sigma: what was found, and how well it is known.
+    """
+
+    @property
+    def cost(self) -> float: ...
+
+    @property
+    def off(self) -> Off: ...
+
+    @property
+    def off_sigma(self) -> Off: ...
+
+
+Solved = TypeVar("Solved", bound=Attempt)
+
+
+def fewest_open(
+    groups: tuple[str, ...],
+    first: Solved,
+    unknowns: Mapping[str, int],
+    attempt: Callable[[tuple[str, ...], Solved], Solved],
+) -> tuple[tuple[str, ...], Solved]:
+    """The groups that are to be left open, and what is found then.
+
+    Each has to pay for itself: all are left open, and then closed again one after the other. Alone, the heights, the
+    scale and the biases may each pass for the others.
+
+    Args:
+      groups, first: those that were found to be off before, and the problem solved with these open.
+      unknowns: of each group that may be left open.
+      attempt: solves with some groups open, from an attempt with others.
+    """
+
+    def price(of: tuple[str, ...]) -> float:
+        return sum(DECIDED + _PRICE * unknowns[group] for group in of)
+
+    def paid(tried: tuple[tuple[str, ...], Solved]) -> float:
+        return tried[1].cost + price(tried[0])
+
+    tried = [(groups, first), (tuple(unknowns), attempt(tuple(unknowns), first))]
+    best = tried[0] if first.cost - tried[1][1].cost < DECIDED else tried[1]
+    while True:
+        fewer = [tuple(g for g in best[0] if g != group) for group in best[0] if not _needed(best[1], group, price)]
+        tried += [(left, attempt(left, best[1])) for left in fewer if left not in [known for known, _ in tried]]
+        better = min(tried, key=paid)
+        if better[0] == best[0] or len(better[0]) >= len(best[0]):
+            return better
+        best = better
+
+
+def _needed(solved: Attempt, group: str, price: Callable[[tuple[str, ...]], float]) -> bool:
+    """Whether a group is known to be off without a trial: what is far off takes long to be solved without."""
+    return solved.off.strength(solved.off_sigma, group) > _SURE * price((group,))
