@@ -25,7 +25,7 @@ from uwbslam_jax.settings import Config, Found, Params
 
 UNSOLVED = (SingularError, np.linalg.LinAlgError)
 """What a solution of the run raises where its equations have none [exceptions]: the run goes on without."""
-_LOOKS = 5
+_LOOKS = 2
 """Looks of the host that the solution may take at least, and as many that the drawing may."""
 _KEYFRAMES_A_LOOK = 100
 """For so many keyframes it may take one more: the host waits for what is due, and a robot drives on meanwhile. A
@@ -33,7 +33,7 @@ solution takes some 0.7 ms a keyframe here, and a look comes every 250 ms at 40 
 With more, what is published would be mended later."""
 _GROWTH = 1.25
 """A revision is begun when the graph has grown by so much since the last one."""
-_FEWEST = 24
+_FEWEST = 12
 """Keyframes of the first one."""
 _NEWS = 9.0
 """Squared Mahalanobis distance of a beacon from where the state has it, beyond which that is wrong."""
@@ -156,7 +156,7 @@ def is_news(solution: Solution, state: State, graph: Graph, known: Found) -> boo
     slots, places, at = _current(solution, graph)
     if len(slots) < 2:
         return False
-    if _differs(solution.found, known):
+    if _differs(solution, known):
         return True
     mean, P = np.asarray(state.belief.mean, float), np.asarray(state.belief.cov, float)
     for slot, place, b in zip(slots, places, at, strict=True):
@@ -168,13 +168,16 @@ def is_news(solution: Solution, state: State, graph: Graph, known: Found) -> boo
     return bool(np.sqrt(np.mean(off**2)) > _NEWS_M)
 
 
-def _differs(found: Found, known: Found) -> bool:
-    """Whether what ranges are off by is not what was known of it."""
-    if found.bias.keys() - known.bias or found.height.keys() - known.height or bool(found.scale) != bool(known.scale):
+def _differs(solution: Solution, known: Found) -> bool:
+    """Whether what ranges are off by is not what was known of it, by more than it is uncertain."""
+    found, sigma = solution.found, solution.sigma
+    if any(bool(getattr(found, group)) != bool(getattr(known, group)) for group in ("bias", "height", "scale")):
         return True
-    off = max((abs(found.bias[slot] - known.bias.get(slot, 0.0)) for slot in found.bias), default=0.0)
-    high = max((abs(found.height[slot] - known.height.get(slot, 0.0)) for slot in found.height), default=0.0)
-    return off > _NEWS_M or high > _NEWS_HEIGHT_M or abs(found.scale - known.scale) > _NEWS_SCALE
+    pairs = [(found.scale - known.scale, sigma.scale, _NEWS_SCALE)]
+    for group, least in (("bias", _NEWS_M), ("height", _NEWS_HEIGHT_M)):
+        now, before, spread = (getattr(each, group) for each in (found, known, sigma))
+        pairs += [(value - before.get(slot, 0.0), spread[slot], least) for slot, value in now.items()]
+    return any(abs(off) > max(least, _NEWS**0.5 * spread) for off, spread, least in pairs)
 
 
 def take_over(config: Config, params: Params, revision: Revision, state: State, graph: Graph) -> State:

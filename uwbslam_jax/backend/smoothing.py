@@ -88,8 +88,9 @@ def solve(
     problem = Problem.build(graph, poses, places, host)
     if problem is None:
         return None
-    groups = tuple(group for group in problem.groups if getattr(known or Found(), group))
-    first = problem.freed(groups).minimise(*problem.split(problem.start(poses, places)))
+    known = known or Found()
+    groups = tuple(group for group in problem.groups if getattr(known, group))
+    first = problem.freed(groups).minimise(*problem.split(problem.start(poses, places))[:2], problem.known(known))
     _, best = fewest_open(groups, first, problem.groups, lambda groups, before: before.freed(groups))
     return best.solution()
 
@@ -191,6 +192,11 @@ class Problem(PoseGraph):
         """Levenberg-Marquardt from poses (N, 3), places (B, 2) and what is off."""
         x = self.risen(self.joined(poses, places, off))
         return _Solved(self, *self.descend(x, _STAGES, moves=_MOVES, enough=_ENOUGH))
+
+    def known(self, found: Found) -> Off:
+        """By node."""
+        bias, height = (np.array([by.get(slot, 0.0) for slot in self.slots]) for by in (found.bias, found.height))
+        return Off(bias, height, found.scale)
 
     def found(self, off: Off) -> Found:
         """By slot."""

@@ -95,6 +95,7 @@ def fewest_open(
     first: Solved,
     unknowns: Mapping[str, int],
     attempt: Callable[[tuple[str, ...], Solved], Solved],
+    each: float = DECIDED,
 ) -> tuple[tuple[str, ...], Solved]:
     """The groups that are to be left open, and what is found then.
 
@@ -105,10 +106,11 @@ def fewest_open(
       groups, first: those that were found to be off before, and the problem solved with these open.
       unknowns: of each group that may be left open.
       attempt: solves with some groups open, from an attempt with others.
+      each: log-likelihood that a group which was not found before has to gain besides what its unknowns have to.
     """
 
     def price(of: tuple[str, ...]) -> float:
-        return sum(DECIDED + _PRICE * unknowns[group] for group in of)
+        return sum((each if group not in groups else 0.0) + _PRICE * unknowns[group] for group in of)
 
     def paid(tried: tuple[tuple[str, ...], Solved]) -> float:
         return tried[1].cost + price(tried[0])

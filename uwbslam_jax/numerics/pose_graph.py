@@ -15,7 +15,7 @@ import numpy as np
 from uwbslam_jax.numerics.freedom import HEIGHT_START_M, Freedom, Off
 from uwbslam_jax.numerics.robust import soften
 from uwbslam_jax.numerics.se2_host import between, transformed, wrapped
-from uwbslam_jax.numerics.sparse_least_squares import Sink, blocks, elimination, minimise
+from uwbslam_jax.numerics.sparse_least_squares import Sink, blocks, cost_of, elimination, minimise
 
 _HELD = 1e-4
 """Standard deviation of the first pose, which is held [m, m, rad]."""
@@ -208,8 +208,18 @@ class PoseGraph:
         """Unknowns with no height less than HEIGHT_START_M, to start from and for the covariance: at none, a range does
         not change with it."""
         x, at = x.copy(), slice(self.first_height, self.first_height + self._heights)
-        x[at] = np.maximum(np.abs(x[at]), HEIGHT_START_M)
+        x[at] = np.where(x[at] < 0, -1.0, 1.0) * np.maximum(np.abs(x[at]), HEIGHT_START_M)
         return x
+
+    def turned_over(self, x: np.ndarray, stage: Stage) -> np.ndarray | None:
+        """Unknowns with some antennas as far below the robot's as they were above, or above, where that explains the
+        ranges between places better; None where it does not. No small move leads there."""
+        fill, found = self.rows(x[:3], stage), x
+        for column in range(self.first_height, self.first_height + self._heights if len(self.pairs.ends) else 0):
+            over = found.copy()
+            over[column] *= -1.0
+            found = over if cost_of(fill, over) < cost_of(fill, found) else found
+        return None if found is x else found
 
     def bias_column(self, places: np.ndarray) -> np.ndarray:
         """Columns of the biases of places (n,)."""
@@ -239,7 +249,8 @@ class PoseGraph:
         held, cost = x[:3].copy(), np.inf
         for stage in stages:
             x, cost = minimise(self.rows(held, stage), x, self.rank, **effort)
-        return x, cost
+        over = self.turned_over(x, stages[-1])
+        return (x, cost) if over is None else minimise(self.rows(held, stages[-1]), over, self.rank, **effort)
 
     def rows(self, held: np.ndarray, stage: Stage) -> Callable[[np.ndarray, Sink], None]:
         """What puts whitened rows of held start, edges, steady velocity, ranges, pairs and priors into a sink."""

@@ -23,6 +23,9 @@ from uwbslam_jax.startup.placement import Placement, Problem
 
 _MOVED_ENOUGH_M = 1.0
 """A robot that has not moved so far is waited for: over less, the noise of the ranges hides the directions [m]."""
+_EACH = 0.0
+"""That ranges are not as configured is decided; what it is, heights or biases, need only be likely: the back end will
+tell, and to go on with neither would bend the track [log-likelihood]."""
 _HEADING_ENOUGH = 0.026
 """Start-up ends when the robot's heading among the beacons is known this well [rad]."""
 _UNDRAWN_HEADING, _UNDRAWN_SIGMA = 0.15, 0.05
@@ -95,7 +98,7 @@ def _explain(problem: Problem) -> tuple[Problem, list[Placement], tuple[str, ...
         return problem.freed(groups).minimise(before.beacons, before.poses, before.off)
 
     found = explanations(problem)
-    groups, _ = fewest_open((), found[0], problem.groups, again)
+    groups, _ = fewest_open((), found[0], problem.groups, again, _EACH)
     freed = problem.freed(groups)
     return freed, explanations(freed) if groups else found, groups
 
