@@ -100,12 +100,15 @@ class BeaconEstimate:
       position: (2,) [m].
       cov: (2, 2) [m^2].
       status: see there.
+      z, sigma_z: of its antenna above the floor, as configured (sigma 0) or found; NaN where neither is the case [m].
     """
 
     id: int
     position: np.ndarray
     cov: np.ndarray
     status: BeaconStatus
+    z: float = math.nan
+    sigma_z: float = math.nan
 
 
 @dataclass(frozen=True, slots=True)

@@ -38,7 +38,7 @@ def make_result() -> Result:
         online_covs=covs,
         beacons=[
             BeaconEstimate(4_000_000_000, np.array([5.0, 6.0]), np.diag([0.01, 0.04]), BeaconStatus.SILENT),
-            BeaconEstimate(1, np.array([1.0, 2.0]), np.diag([0.04, 0.01]), BeaconStatus.STATIC),
+            BeaconEstimate(1, np.array([1.0, 2.0]), np.diag([0.04, 0.01]), BeaconStatus.STATIC, 1.4, 0.02),
         ],
         beacon_tracks={1: track, 4_000_000_000: track[6:]},
         map=MapImage(log_odds, 0.05, np.array([-1.0, -2.0])),
@@ -98,8 +98,8 @@ def test_beacons(run: Path) -> None:
         rows = list(csv.DictReader(file))
     assert [row["id"] for row in rows] == ["1", "4000000000"]
     first = {"id": "1", "x": "1.000000", "y": "2.000000", "sigma_x": "0.200000", "sigma_y": "0.100000"}
-    assert rows[0] == first | {"status": "static"}
-    assert rows[1]["status"] == "silent"
+    assert rows[0] == first | {"z": "1.400000", "sigma_z": "0.020000", "status": "static"}
+    assert (rows[1]["z"], rows[1]["sigma_z"], rows[1]["status"]) == ("", "", "silent")
 
 
 def read_pgm(path: Path) -> np.ndarray:

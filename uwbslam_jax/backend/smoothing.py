@@ -126,6 +126,10 @@ class _Solved:
         tail = self.problem.size - self.problem.first_bias
         return self.problem.off(np.sqrt(np.maximum(np.diag(self.cov)[-tail:], 0.0)))
 
+    def strength(self, group: str) -> float:
+        """See Off."""
+        return self.off.strength(self.off_sigma, group)
+
     def freed(self, groups: tuple[str, ...]) -> _Solved:
         """Solved with other groups of unknowns left open."""
         poses, places, off = self.problem.split(self.x)

@@ -75,13 +75,14 @@ def write_trajectory(stamps: np.ndarray, poses: np.ndarray, path: Path) -> None:
 
 
 def write_beacons(beacons: list[BeaconEstimate], path: Path) -> None:
-    """CSV with a head line: id,x,y,sigma_x,sigma_y,status [m]."""
+    """CSV with a head line: id,x,y,sigma_x,sigma_y,z,sigma_z,status [m]; a height that is not known is left empty."""
     with path.open("w", encoding="ascii", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["id", "x", "y", "sigma_x", "sigma_y", "status"])
+        writer.writerow(["id", "x", "y", "sigma_x", "sigma_y", "z", "sigma_z", "status"])
         for beacon in sorted(beacons, key=lambda beacon: beacon.id):
-            numbers = [*beacon.position, *np.sqrt(np.diagonal(beacon.cov))]
-            writer.writerow([beacon.id, *(f"{value:.6f}" for value in numbers), beacon.status])
+            numbers = [f"{value:.6f}" for value in (*beacon.position, *np.sqrt(np.diagonal(beacon.cov)))]
+            height = ["" if math.isnan(value) else f"{value:.6f}" for value in (beacon.z, beacon.sigma_z)]
+            writer.writerow([beacon.id, *numbers, *height, beacon.status])
 
 
 def write_map(image: MapImage, directory: Path) -> None:

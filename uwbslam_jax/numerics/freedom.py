@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import NamedTuple, Protocol, TypeVar
+from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
@@ -62,7 +62,6 @@ class Off(NamedTuple):
     wheels: float = 0.0
     lidar: float = 0.0
 
-
     def strength(self, sigma: Off, group: str) -> float:
         """Log-likelihood that closing a group would cost at least, by how well it is known (Wald's test)."""
         of_group = [np.atleast_1d(np.abs(getattr(off, group))) for off in (self, sigma)]
@@ -70,21 +69,16 @@ class Off(NamedTuple):
         return 0.5 * float(np.max((of_group[0][known] / of_group[1][known]) ** 2, initial=0.0))
 
 
+@runtime_checkable
 class Attempt(Protocol):
-    """A problem solved with some groups of unknowns left open.
-
-    Attributes:
-      cost: negative log-likelihood. off, off_sigma: what was found, and how well it is known.
-    """
+    """A problem solved with some groups of unknowns left open. cost: negative log-likelihood."""
 
     @property
     def cost(self) -> float: ...
 
-    @property
-    def off(self) -> Off: ...
-
-    @property
-    def off_sigma(self) -> Off: ...
+    def strength(self, group: str) -> float:
+        """See Off."""
+        ...
 
 
 Solved = TypeVar("Solved", bound=Attempt)
@@ -128,4 +122,4 @@ def fewest_open(
 
 def _needed(solved: Attempt, group: str, price: Callable[[tuple[str, ...]], float]) -> bool:
     """Whether a group is known to be off without a trial: what is far off takes long to be solved without."""
-    return solved.off.strength(solved.off_sigma, group) > _SURE * price((group,))
+    return solved.strength(group) > _SURE * price((group,))

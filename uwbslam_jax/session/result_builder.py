@@ -35,6 +35,14 @@ _LATE = (
 """Warning [text], with the time, its standard deviation [s], which way, and the setting that mends it [s]."""
 
 
+_OBSERVED_M = 0.33
+"""A height that is known no better than this is not told: a third of what is taken for it beforehand [m]."""
+_NOTABLE_SCALE = 0.01
+"""A scale of the ranges beyond this is told: a decimetre in a hall [m/m]."""
+_SCALED = "ranges are off by {:+.1%} of the distance: solved from the run; uwb.bias_scale = {:.3f} has it so at once"
+"""Warning [text]."""
+
+
 @dataclass
 class Facts:
     """What the Result tells besides what the session knows.
@@ -141,11 +149,14 @@ def _unplaced(session: Session, facts: Facts) -> list[str]:
 
 
 def _biases(session: Session) -> list[str]:
-    """A warning where notable biases were found that nobody configured."""
+    """Warnings where a notable bias or scale was found that nobody configured."""
     found = {session.ids[slot]: bias for slot, bias in session.found.bias.items()}
     told = ", ".join(f"node {node} {bias:+.2f} m" for node, bias in sorted(found.items()))
     advice = "set uwb.bias if the radios are known"
-    return [f"ranges are biased: {told} were solved from the run; {advice}"] if session.biased else []
+    warnings = [f"ranges are biased: {told} were solved from the run; {advice}"] if session.biased else []
+    scale = session.found.scale
+    setting = (1.0 + session.settings.uwb.bias_scale) * (1.0 + scale) - 1.0
+    return warnings + ([_SCALED.format(scale, setting)] if abs(scale) > _NOTABLE_SCALE else [])
 
 
 def _latency(session: Session) -> list[str]:
@@ -167,22 +178,34 @@ def _beacons(session: Session, ids: dict[int, int]) -> list[BeaconEstimate]:
             told[node] = solution.beacons[b], solution.cov[block, block]
     active = np.asarray(session.state.active)
     mean, cov = np.asarray(session.state.belief.mean, float), np.asarray(session.state.belief.cov, float)
-    found = []
+    found, heights = [], _heights(session)
     for slot in range(1, len(active)):
+        high = heights.get(slot, ())
         status = session.beacon_status(slot)
         node = session.graph.ranges.node(slot)
         if node in told and status is not BeaconStatus.MOVING:
             position, block = told[node]
-            found.append(BeaconEstimate(ids[slot], position, block, status))
+            found.append(BeaconEstimate(ids[slot], position, block, status, *high))
         elif active[slot]:
             two = slice(2 * slot, 2 * slot + 2)
-            found.append(BeaconEstimate(ids[slot], mean[two], cov[two, two], status))
+            found.append(BeaconEstimate(ids[slot], mean[two], cov[two, two], status, *high))
         elif slot in session.history.beacons:
             left = status if status in (BeaconStatus.MOVING, BeaconStatus.SILENT) else BeaconStatus.DROPPED
             # one that was dropped is remembered where it rested last
             position, block = told.get((slot, node[1] - 1), session.history.beacons[slot])
-            found.append(BeaconEstimate(ids[slot], position.astype(float), block.astype(float), left))
+            found.append(BeaconEstimate(ids[slot], position.astype(float), block.astype(float), left, *high))
     return sorted(found, key=lambda beacon: beacon.id)
+
+
+def _heights(session: Session) -> dict[int, tuple[float, float]]:
+    """Slot -> height of the antenna above the floor and its standard deviation [m], of those that are known."""
+    configured = session.settings.uwb.height
+    told = {slot: (configured[str(node)], 0.0) for node, slot in session.slots.items() if str(node) in configured}
+    if session.hindsight is not None:
+        solution, floor = session.hindsight.solution, session.settings.robot.antenna[2]
+        sigma = {slot: s for slot, s in solution.sigma.height.items() if s < _OBSERVED_M}
+        told |= {slot: (floor + solution.off.height[slot], s) for slot, s in sigma.items()}
+    return told
 
 
 def _relative_beacons(session: Session, relative: Relative) -> list[BeaconEstimate]:
@@ -271,6 +294,8 @@ def _summary(session: Session, facts: Facts) -> dict[str, Any]:
         "ranges_used": used,
         "ranges_rejected": rejected,
         "found_bias": {str(ids[slot]): bias for slot, bias in sorted(session.found.bias.items())},
+        "found_scale": session.found.scale,
+        "found_height": {str(ids[slot]): height for slot, height in sorted(session.found.height.items())},
         "dropped": dict(sorted(facts.dropped.items())),
         "truncated": facts.truncated,
         "warnings": facts.warnings,

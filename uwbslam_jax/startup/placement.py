@@ -71,6 +71,10 @@ class Placement:
         """(B,) largest standard deviation of each beacon's position in the start frame [m]."""
         return largest_sigma(self.cov[self.poses.size :, self.poses.size :])
 
+    def strength(self, group: str) -> float:
+        """See Off."""
+        return self.off.strength(self.off_sigma, group)
+
     def only(self, kept: list[int]) -> Placement:
         """The same with some of the beacons, given by their index."""
         n = self.poses.size

@@ -128,10 +128,12 @@ def beacon_table(beacons: Sequence[BeaconEstimate]) -> str:
     rows = []
     for b in sorted(beacons, key=lambda b: b.id):
         sigma = np.sqrt(np.maximum(np.diagonal(b.cov), 0))
-        numbers = [*((v, 3) for v in b.position), *((v, 4) for v in sigma)]
+        numbers = [*((v, 3) for v in b.position), *((v, 4) for v in sigma), (b.z, 2), (b.sigma_z, 2)]
         cells = "".join(f'<td class="n">{figure(float(v), "", digits)}</td>' for v, digits in numbers)
         kind = re.sub(r"\W", "", b.status)
         status = html.escape(b.status)
         rows.append(f'<tr><td class="n">{b.id}</td>{cells}<td class="status {kind}">{status}</td></tr>')
-    head = "".join(f'<th class="n">{name}</th>' for name in ("Id", "x [m]", "y [m]", "σ x [m]", "σ y [m]"))
+    head = "".join(
+        f'<th class="n">{name}</th>' for name in ("Id", "x [m]", "y [m]", "σ x [m]", "σ y [m]", "z [m]", "σ z [m]")
+    )
     return f'<div class="scroll"><table><thead><tr>{head}<th>Status</th></tr></thead>{"".join(rows)}</table></div>'
