@@ -31,13 +31,14 @@ def turned(theta: float, v: np.ndarray) -> np.ndarray:
     return np.array([c * v[0] - s * v[1], s * v[0] + c * v[1]])
 
 
-def make(truth: np.ndarray, seed: int = 0, bias=None, sight: np.ndarray | None = None) -> Graph:
+def make(truth: np.ndarray, seed: int = 0, bias=None, sight: np.ndarray | None = None, height=None, scale=0.0) -> Graph:
     """A graph of a track: edges to the keyframe before, and to the one a round before, ranges to every beacon.
 
-    bias: by slot [m]; sight: (3, 3) information of every edge.
+    bias: by slot [m]; sight: (3, 3) information of every edge; height: of the antennas over the robot's, by slot [m];
+    scale: of all ranges [m/m].
     """
     rng = np.random.default_rng(seed)
-    bias = bias or dict.fromkeys(range(K), 0.0)
+    bias, height = (given or dict.fromkeys(range(K), 0.0) for given in (bias, height))
     information = np.diag([0.005**-2, 0.005**-2, 0.001**-2]) if sight is None else sight
     drift = np.cumsum(rng.normal(0, [0.01, 0.01, 0.002], truth.shape), axis=0)
     graph = Graph()
@@ -55,12 +56,14 @@ def make(truth: np.ndarray, seed: int = 0, bias=None, sight: np.ndarray | None =
                 pose = (1 - share) * truth[at] + share * truth[at + 1]
                 antenna = pose[:2] + turned(pose[2], ANTENNA)
                 ends = [turned(-p[2], antenna - p[:2]) for p in truth[[at, at + 1]]]
-                d = np.linalg.norm(antenna - spot) + bias[0] + bias[slot] + rng.normal(0, 0.05)
+                slant = np.hypot(np.linalg.norm(antenna - spot), height[slot])
+                d = (1 + scale) * slant + bias[0] + bias[slot] + rng.normal(0, 0.05)
                 graph.ranges.means.append((at, slot, 0, share, *ends, d, 0.05, False, 0.0))
     for i in BEACONS:
         for j in BEACONS:
             if i < j:
-                d = np.linalg.norm(BEACONS[i] - BEACONS[j]) + bias[i] + bias[j]
+                slant = np.hypot(np.linalg.norm(BEACONS[i] - BEACONS[j]), height[i] - height[j])
+                d = (1 + scale) * slant + bias[i] + bias[j]
                 graph.ranges.pairs[(i, 0), (j, 0)] = deque(d + rng.normal(0, SIGMA_N, 200))
     return graph
 

@@ -6,13 +6,14 @@ import dataclasses
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
 from uwbslam_jax import settings
 from uwbslam_jax.errors import ConfigError
 from uwbslam_jax.files import settings_file
-from uwbslam_jax.settings import MapSettings, Settings
+from uwbslam_jax.settings import Found, MapSettings, Settings, make_host_params, make_params
 
 positive = st.floats(1e-6, 1e6)
 finite = st.floats(-1e6, 1e6)
@@ -135,3 +136,17 @@ def test_an_unreadable_file_is_a_config_error_that_names_it(
         settings_file.load_settings(path)
     assert str(path) in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_what_a_run_has_found_comes_on_top_of_what_is_configured():
+    settings = settings_file.from_dict({"uwb": {"bias": {"7": 0.1}, "bias_scale": 0.02, "height": {"7": 1.5}}})
+    slots, found = {0: 0, 7: 1, 9: 2}, Found({0: 0.2, 1: 0.1}, {2: 0.8}, 0.05)
+    host = make_host_params(settings, make_params(settings, slots), slots)
+    assert host.surveyed[:3].tolist() == [True, True, False]
+    beyond, made = host.beyond(found), make_host_params(settings, make_params(settings, slots, found), slots)
+    for name in ("bias", "height", "bias_scale"):
+        np.testing.assert_allclose(getattr(beyond, name), getattr(made, name), rtol=1e-6)
+    measured = (1 + beyond.bias_scale) * 5.0 + beyond.bias[0] + beyond.bias[1]
+    assert beyond.slant(measured, 0, 1) == pytest.approx(5.0)
+    # as the problem has it: the configured model first, what was found after it
+    assert host.slant(measured, 0, 1) == pytest.approx(1.05 * 5.0 + 0.3)

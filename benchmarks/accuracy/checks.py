@@ -46,6 +46,7 @@ class Trial:
       hypotheses: (T,) how many explanations of the start were alive.
       warnings: one line each.
       memory: (m,) memory in use over the run, evenly in its messages [MB].
+      scale: of the ranges, as it was found [m/m].
     """
 
     t: np.ndarray
@@ -57,6 +58,7 @@ class Trial:
     hypotheses: np.ndarray = field(default_factory=lambda: np.zeros(0))
     warnings: Sequence[str] = ()
     memory: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    scale: float = 0.0
 
     @property
     def offset(self) -> np.ndarray:
@@ -160,6 +162,11 @@ def _beacon_errors(trial: Trial, node: int, begin: float, end: float) -> np.ndar
 def untold(trial: Trial, word: str) -> float:
     """0 where a warning has the word, 1 where none has."""
     return float(not any(word in warning for warning in trial.warnings))
+
+
+def scale_error(trial: Trial, scale: float) -> float:
+    """By how much the scale of the ranges was found wrong [%]. scale: the true one [m/m]."""
+    return 100.0 * abs(trial.scale - scale)
 
 
 def memory_growth(trial: Trial) -> float:

@@ -137,6 +137,14 @@ ROWS: dict[str, Row] = {
         0.15,
         checks=(Check("not told as biased", 0.0, lambda trial, _: checks.untold(trial, "biased")),),
     ),
+    "heights": Row("heights of 0.3 to 3 m over the robot's antenna, not configured", 0.015, 0.015),
+    "heights_robot_only": Row("the same, robot-to-beacon ranges only", 0.015, 0.02),
+    "scale": Row(
+        "ranges 7 % too long, not configured",
+        0.015,
+        0.02,
+        checks=(Check("scale off by [%]", 0.3, lambda trial, made: checks.scale_error(trial, made.uwb.scale)),),
+    ),
     "office": Row(
         "office 60 x 40 m, 300 m driven, 8 beacons of 25 m reach",
         0.05,

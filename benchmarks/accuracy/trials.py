@@ -132,4 +132,5 @@ def lay_over(result: us.Result, truth: us.Truth, motion: RigidMotion, memory: Se
         hypotheses=result.diagnostics["hypotheses"],
         warnings=tuple(result.summary["warnings"]),
         memory=np.asarray(memory, float),
+        scale=result.summary["found_scale"],
     )

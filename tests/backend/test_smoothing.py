@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from derivatives import stacked
 from loop_graph import BEACONS, host, loop, make, solved, turned
 
 from uwbslam_jax.backend import smoothing
 from uwbslam_jax.backend.graph import Graph
-from uwbslam_jax.numerics import Stage, sparse_least_squares
+from uwbslam_jax.numerics import Freedom, Stage, sparse_least_squares
 from uwbslam_jax.numerics.se2_host import between
 from uwbslam_jax.settings import Found
 
@@ -82,6 +83,60 @@ def test_biases_are_found_and_not_invented() -> None:
     assert solved(make(truth, seed=5)).found == Found()
 
 
+HEIGHT = {0: 0.0, 1: 0.4, 2: 2.8, 3: 1.5, 4: 1.0}
+"""Of the antennas over the robot's, by slot [m]."""
+
+
+def test_heights_that_nobody_has_measured_are_found() -> None:
+    truth = loop()
+    graph = make(truth, height=HEIGHT)
+    found = solved(graph)
+    known = solved(graph, height=np.array(list(HEIGHT.values())), surveyed=np.ones(5, bool))
+    assert found.freedom == Freedom.of(("height",))
+    for slot, height in HEIGHT.items():
+        if slot:
+            assert abs(found.off.height[slot] - height) < 3.3 * found.sigma.height[slot]
+            assert found.sigma.height[slot] < 0.2
+    assert nees(found, truth) < 26.1  # chi-square of 8 degrees of freedom, 0.1 %
+    robot, beacons = apart(found, truth)
+    assert np.sqrt(np.mean(robot**2)) < 1.2 * np.sqrt(np.mean(apart(known, truth)[0] ** 2))
+    assert beacons.max() < 0.04
+    assert known.found == Found()
+
+
+def test_an_antenna_below_that_of_the_robot_is_found_there() -> None:
+    """Its ranges to the robot do not tell, those to the other beacons do."""
+    found = solved(make(loop(), height=HEIGHT | {3: -1.5}))
+    assert found.off.height[3] == pytest.approx(-1.5, abs=0.1)
+    assert found.off.height[2] == pytest.approx(2.8, abs=0.1)
+
+
+def test_a_scale_of_the_ranges_is_found() -> None:
+    truth = loop()
+    found = solved(make(truth, scale=0.07))
+    assert found.freedom == Freedom.of(("scale",))._replace(wheels=0.0)
+    assert found.off.scale == pytest.approx(0.07, abs=0.003)
+    assert found.sigma.scale == pytest.approx(0.0022, abs=0.0005)  # a LiDAR is not better
+    assert apart(found, truth)[1].max() < 0.04
+
+
+def test_what_was_found_before_is_where_the_next_solution_starts() -> None:
+    graph, places = make(loop(), height=HEIGHT), {(slot, 0): spot for slot, spot in BEACONS.items()}
+    first = solved(graph)
+    again = smoothing.solve(graph, first.poses, places, host(), first.found)
+    assert again.off.height == pytest.approx(first.off.height, abs=0.02)
+    flat = smoothing.solve(make(loop()), first.poses, places, host(), first.found)
+    assert flat.found == Found()
+
+
+def test_ranges_of_a_coarse_radio_are_believed_where_all_are_loud() -> None:
+    """Walls make some of the ranges loud; a radio that is coarser than uwb.sigma_n all of them."""
+    loud, to = np.array([True] * 9 + [False] + [True] * 10), np.repeat([0, 1], 10)
+    assert smoothing._by_the_radio(loud, to)
+    loud[:3] = False
+    assert not smoothing._by_the_radio(loud, to)
+
+
 def test_configured_biases_and_heights_are_taken_off() -> None:
     truth = loop()
     bias = np.array([0.05, 0.2, -0.15, 0.1, -0.2])
@@ -89,7 +144,7 @@ def test_configured_biases_and_heights_are_taken_off() -> None:
     means = graph.ranges.means.values
     offset = bias[0] + bias[means["slot"]]
     means["distance"] = np.hypot(means["distance"] - offset, 1.5) + offset
-    found = solved(graph, bias=bias, height=np.array([0.0, 1.5, 1.5, 1.5, 1.5]))
+    found = solved(graph, bias=bias, height=np.array([0.0, 1.5, 1.5, 1.5, 1.5]), surveyed=np.ones(5, bool))
     assert found.found == Found()
     assert apart(found, truth)[1].max() < 0.03
 

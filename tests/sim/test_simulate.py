@@ -254,6 +254,10 @@ def test_special_radios() -> None:
     error = np.array([m.range for m in messages]) - true_distances(biased, messages)
     expected = np.array([biased.uwb.bias[m.source] + biased.uwb.bias[m.target] for m in messages])
     assert abs(np.mean(error - expected)) < 4 * 0.1 / np.sqrt(error.size)
+    scaled = make_scenario("scale", 1, duration_s=30.0)
+    messages = ranges_of(scaled)
+    ratio = np.array([m.range for m in messages]) / true_distances(scaled, messages)
+    assert np.median(ratio) == pytest.approx(1.07, abs=0.003)
     office = ready("office", 1)
     messages = ranges_of(replace(office, duration=20.0))
     assert true_distances(office, messages).max() <= 25.0

@@ -223,10 +223,10 @@ def take_over(config: Config, params: Params, revision: Revision, state: State, 
 
 def _current(solution: Solution, graph: Graph) -> tuple[list[int], np.ndarray, list[int]]:
     """Slots of the beacons that still rest where the solution has them, their places (B, 2), their numbers in it."""
-    sigma = largest_sigma(solution.cov[3:, 3:])
-    at = [
-        b for b, node in enumerate(solution.nodes) if graph.ranges.node(node[0]) == node and sigma[b] < SIGMA_ENOUGH_M
-    ]
+    # what the scale leaves open all beacons share with the track
+    enough = SIGMA_ENOUGH_M + solution.sigma.scale * np.linalg.norm(solution.beacons, axis=1)
+    sure = largest_sigma(solution.cov[3:, 3:]) < enough
+    at = [b for b, node in enumerate(solution.nodes) if graph.ranges.node(node[0]) == node and sure[b]]
     return [solution.nodes[b][0] for b in at], solution.beacons[at], at
 
 

@@ -106,18 +106,21 @@ def fewest_open(
     def price(of: tuple[str, ...]) -> float:
         return sum((each if group not in groups else 0.0) + _PRICE * unknowns[group] for group in of)
 
-    def paid(tried: tuple[tuple[str, ...], Solved]) -> float:
-        return tried[1].cost + price(tried[0])
+    def paid(of: tuple[str, ...]) -> float:
+        return tried[of].cost + price(of)
 
-    tried = [(groups, first), (tuple(unknowns), attempt(tuple(unknowns), first))]
-    best = tried[0] if first.cost - tried[1][1].cost < DECIDED else tried[1]
+    every = tuple(unknowns)
+    tried = {groups: first, every: attempt(every, first)}
+    best = groups if first.cost - tried[every].cost < DECIDED else every
     while True:
-        fewer = [tuple(g for g in best[0] if g != group) for group in best[0] if not _needed(best[1], group, price)]
-        tried += [(left, attempt(left, best[1])) for left in fewer if left not in [known for known, _ in tried]]
-        better = min(tried, key=paid)
-        if better[0] == best[0] or len(better[0]) >= len(best[0]):
-            return better
+        fewer = [tuple(g for g in best if g != group) for group in best if not _needed(tried[best], group, price)]
+        tried |= {left: attempt(left, tried[best]) for left in fewer if left not in tried}
+        better = min([best, *fewer], key=paid)
+        if better == best:
+            break
         best = better
+    best = min(groups, best, key=paid)
+    return best, tried[best]
 
 
 def _needed(solved: Attempt, group: str, price: Callable[[tuple[str, ...]], float]) -> bool:
