@@ -11,7 +11,7 @@ import pytest
 import small_room as room
 from derivatives import assert_gradient, double
 
-from uwbslam_jax.estimator import matching
+from uwbslam_jax.estimator import matching, wide_search
 from uwbslam_jax.mapping import grid as occupancy
 from uwbslam_jax.mapping.sweep import find_surface, undo_motion
 from uwbslam_jax.numerics.gaussian import Gaussian
@@ -36,7 +36,7 @@ def assess(grid, sweep, pose, resolution):
 
 @partial(jax.jit, static_argnums=4)
 def search(grid, sweep, prior, sigma_l, resolution):
-    return matching.search(grid, view_of(sweep, sigma_l), prior, prior.mean, prior.mean, resolution)
+    return wide_search.search(grid, view_of(sweep, sigma_l), prior, prior.mean, prior.mean, resolution)
 
 
 def sweep_at(pose, beams=BEAMS, walls=room.WALLS):

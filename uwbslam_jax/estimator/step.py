@@ -19,6 +19,7 @@ from uwbslam_jax.estimator import match_fusion, matching, motion, paper, ranging
 from uwbslam_jax.estimator.batched_cond import seldom
 from uwbslam_jax.estimator.matching import Match, View
 from uwbslam_jax.estimator.state import Estimate, Seen, State
+from uwbslam_jax.estimator.wide_search import search
 from uwbslam_jax.mapping import Grid, Sweep, grid as occupancy, undo_motion
 from uwbslam_jax.measurements import Frame
 from uwbslam_jax.numerics import Gaussian, rotation, safe_norm, transform_points, wrap_angle
@@ -192,7 +193,7 @@ def _match(config: Config, state: State, belief: Gaussian, seen: Seen) -> _Found
     def wide(
         found: Float[Array, "3"], grid: Grid, view: View, expected: Gaussian, last: Float[Array, "3"]
     ) -> Float[Array, "3"]:
-        return matching.search(grid, view, expected, last, found, resolution)
+        return search(grid, view, expected, last, found, resolution)
 
     expected = prior._replace(cov=prior.cov - jnp.diag(jnp.array(_ALIGN_FLOOR) ** 2) * 0.75)
     # a choice among places: held in a derivative
