@@ -19,7 +19,13 @@ def carried(scenario: Scenario) -> list[Interval]:
 
 def disturbed(scenario: Scenario) -> list[Interval]:
     """When the robot is carried or blind, and the time that it has to find back; no rigid fit may use it."""
-    return [(begin, end + _BACK_S) for begin, end in (*carried(scenario), *scenario.lidar.blind)]
+    off = [(scenario.pause.begin, resumed(scenario))] if scenario.pause is not None else []
+    return [(begin, end + _BACK_S) for begin, end in (*carried(scenario), *scenario.lidar.blind, *off)]
+
+
+def resumed(scenario: Scenario) -> float:
+    """When the recorder is on again after a pause, NaN where there is none."""
+    return float("nan") if scenario.pause is None else scenario.pause.begin + scenario.pause.lasts
 
 
 def first_turn(scenario: Scenario) -> float:

@@ -123,6 +123,12 @@ ROWS: dict[str, Row] = {
             ),
         ),
     ),
+    "gap": Row(
+        "switched off for an hour, carried and turned by 120 deg meanwhile",
+        0.03,
+        0.03,
+        checks=(Check("lost for [s]", 2.0, lambda t, made: checks.time_lost(t, intervals.resumed(made))),),
+    ),
     "slow_lidar": Row("1 Hz scans of 361 beams, 3 beacons, robot-only ranges, odometry", 0.10, 0.15),
     "sparse": Row(
         "a scan every metre (2.5 s), 181 beams, wheels at 10 Hz",
@@ -151,5 +157,6 @@ ROWS: dict[str, Row] = {
         0.08,
         checks=(Check("memory growth in the second lap [MB]", 50.0, lambda trial, _: checks.memory_growth(trial)),),
     ),
+    "large": Row("building of 150 x 100 m, 2 km driven, 32 beacons of 40 m reach, robot-only ranges", 0.10, 0.10),
 }
 """Scenario -> its row. A scenario that stands for nothing of its own, like the demo's workshop, has none."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from uwbslam_jax.sim import rays, worlds
 from uwbslam_jax.sim.paths import Along, Carried, Path, Piece, Rest, Track, Turn
-from uwbslam_jax.sim.scenario import INF, Beacon, Follow, Lidar, Scenario, Uwb, Walk, Wheels, stream
+from uwbslam_jax.sim.scenario import INF, Beacon, Follow, Lidar, Pause, Scenario, Uwb, Walk, Wheels, stream
 from uwbslam_jax.sim.worlds import World
 
 
@@ -96,6 +96,16 @@ def _laps(world: World, seed: int, duration: float, ids: Sequence[int], drive: _
         track = track.swayed(drive.sway, stream(seed, "sway"))
     path = Path([Rest(drive.rest), Along(track, 0.0, drive.speed * max(duration - drive.rest, 1.0), drive.speed)])
     return Scenario("laps", seed, duration, world, path, _beacons(world, track, seed, ids, height))
+
+
+def _along_corridors(track: Track, seed: int, ids: np.ndarray) -> tuple[Beacon, ...]:
+    """Beacons along the walls on either side of a track, about evenly, the ids (n,) in any order."""
+    rng, n = stream(seed, "beacons"), len(ids)
+    s = (np.arange(n) + rng.uniform(-0.25, 0.25, n)) * track.length / n + rng.uniform(0.0, track.length)
+    pose, offset = track.pose(s), rng.choice([-1.0, 1.0], n) * rng.uniform(0.6, 0.85, n)
+    x, y = pose[:, 0] - offset * np.sin(pose[:, 2]), pose[:, 1] + offset * np.cos(pose[:, 2])
+    ids = rng.permutation(ids)
+    return tuple(Beacon(int(ids[k]), (float(x[k]), float(y[k]))) for k in range(n))
 
 
 def _workshop(seed: int, duration: float | None) -> Scenario:
@@ -234,9 +244,9 @@ def _uwb_silent(seed: int, duration: float | None) -> Scenario:
     return replace(made, uwb=Uwb(silent=((0.4 * made.duration, 0.6 * made.duration),)))
 
 
-def _kidnapped(seed: int, duration: float | None) -> Scenario:
-    """Half way picked up and put down a good part of a lap farther, turned by 120 degrees, unseen by the LiDAR."""
-    made = _hall(seed, duration)
+def _put_elsewhere(made: Scenario, lasts: float) -> tuple[Path, float]:
+    """A path on which the robot is picked up half way and put down a good part of a lap farther, turned by 120 degrees;
+    and when. lasts: how long it is in somebody's arms [s]."""
     track = Track(made.world.lap, 1.2, closed=True)
     driven = 0.8 * (made.duration * 7.0 / 15.0 - 6.0)
     first: list[Piece] = [Rest(4.0), Along(track, 0.0, driven)]
@@ -247,8 +257,33 @@ def _kidnapped(seed: int, duration: float | None) -> Scenario:
     yaw = before[2] + 2.0 * np.pi / 3.0
     back = (tangent - yaw + np.pi) % (2.0 * np.pi) - np.pi
     rest = 0.8 * max(made.duration - when - 6.0, 1.0)
-    pieces = [*first, Carried((x, y, yaw), 1.0), Rest(2.0), Turn(back), Along(track, there, there + rest)]
-    return replace(made, path=Path(pieces), lidar=Lidar(blind=((when, when + 1.0),)))
+    return Path([*first, Carried((x, y, yaw), lasts), Rest(2.0), Turn(back), Along(track, there, there + rest)]), when
+
+
+def _kidnapped(seed: int, duration: float | None) -> Scenario:
+    """Half way carried elsewhere, unseen by the LiDAR."""
+    made = _hall(seed, duration)
+    path, when = _put_elsewhere(made, 1.0)
+    return replace(made, path=path, lidar=Lidar(blind=((when, when + 1.0),)))
+
+
+def _gap(seed: int, duration: float | None) -> Scenario:
+    """Half way switched off for an hour, in which it is carried elsewhere."""
+    made = _hall(seed, duration)
+    path, when = _put_elsewhere(made, 1.0)
+    return replace(made, path=path, pause=Pause(when, when + 1.0, 3600.0))
+
+
+def _large(seed: int, duration: float | None) -> Scenario:
+    """A building of 150 x 100 m, four times round its corridors, 2 km; 32 beacons hear 40 m far."""
+    world = _directed(worlds.office(seed, size=(150.0, 100.0)), seed)
+    track = Track(world.lap, 0.9, closed=True).swayed(0.15, stream(seed, "sway"))
+    path = Path([Rest(4.0), Along(track, 0.0, 4.2 * track.length, 1.6), Rest(2.0)])
+    if duration is not None:
+        path = Path([Rest(4.0), Along(track, 0.0, 1.6 * max(duration - 4.0, 1.0), 1.6)])
+    beacons = _along_corridors(track, seed, 1 + np.arange(32))
+    lidar, uwb = Lidar(rate=5.0, beams=541), Uwb(rate=5.0, beacon_pairs=False, reach=40.0)
+    return Scenario("", seed, duration or path.duration, world, path, beacons, lidar, uwb)
 
 
 def _slow_lidar(seed: int, duration: float | None) -> Scenario:
@@ -293,12 +328,7 @@ def _office(seed: int, duration: float | None) -> Scenario:
     path = Path([Rest(4.0), Along(track, 0.0, 2.0 * track.length), Rest(2.0)])
     if duration is not None:
         path = Path([Rest(4.0), Along(track, 0.0, 0.8 * max(duration - 4.0, 1.0))])
-    rng = stream(seed, "beacons")
-    s = (np.arange(8) + rng.uniform(-0.25, 0.25, 8)) * track.length / 8 + rng.uniform(0.0, track.length)
-    pose, offset = track.pose(s), rng.choice([-1.0, 1.0], 8) * rng.uniform(0.6, 0.85, 8)
-    x, y = pose[:, 0] - offset * np.sin(pose[:, 2]), pose[:, 1] + offset * np.cos(pose[:, 2])
-    ids = rng.permutation(np.arange(11, 19))
-    beacons = tuple(Beacon(int(ids[k]), (float(x[k]), float(y[k]))) for k in range(8))
+    beacons = _along_corridors(track, seed, np.arange(11, 19))
     return Scenario("", seed, duration or path.duration, world, path, beacons, uwb=Uwb(reach=25.0))
 
 
@@ -321,6 +351,7 @@ _MAKERS: dict[str, Callable[[int, float | None], Scenario]] = {
     "blind": _blind,
     "uwb_silent": _uwb_silent,
     "kidnapped": _kidnapped,
+    "gap": _gap,
     "slow_lidar": _slow_lidar,
     "sparse": _sparse,
     "lever_arms": _lever_arms,
@@ -329,6 +360,7 @@ _MAKERS: dict[str, Callable[[int, float | None], Scenario]] = {
     "heights_robot_only": lambda seed, duration: _heights(seed, duration, beacon_pairs=False),
     "scale": lambda seed, duration: replace(_hall(seed, duration), uwb=Uwb(scale=0.07)),
     "office": _office,
+    "large": _large,
 }
 """What makes a scenario of a seed and a duration, its own where None [name -> function]."""
 SCENARIOS = tuple(_MAKERS)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import zlib
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -157,9 +157,18 @@ class Wheels:
     noise_yaw: float = 0.05
 
 
+class Pause(NamedTuple):
+    """A recorder that is switched off from `begin` to `end` of the scenario, which lasts so long by the clock [s]."""
+
+    begin: float
+    end: float
+    lasts: float
+
+
 @dataclass(frozen=True)
 class Scenario:
-    """Everything that a simulation depends on; world, path and beacons share one frame [m], duration in s."""
+    """Everything that a simulation depends on; world, path and beacons share one frame [m], duration in s, without what
+    a pause lasts longer."""
 
     name: str
     seed: int
@@ -170,6 +179,7 @@ class Scenario:
     lidar: Lidar = field(default_factory=Lidar)
     uwb: Uwb = field(default_factory=Uwb)
     wheels: Wheels | None = None
+    pause: Pause | None = None
 
 
 def stream(seed: int, purpose: str) -> np.random.Generator:

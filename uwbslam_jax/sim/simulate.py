@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -38,7 +39,11 @@ def simulate(scenario: Scenario) -> Iterator[Message]:
     """
     streams = (_beacon_truths(scenario), _odometry(scenario), _ranges(scenario), _scans(scenario))
     for _, message in heapq.merge(*streams, key=lambda logged: logged[0]):
-        yield message
+        if scenario.pause is None or message.stamp < stamp(scenario.pause.begin):
+            yield message
+        elif message.stamp >= stamp(scenario.pause.end):
+            longer = scenario.pause.lasts - (scenario.pause.end - scenario.pause.begin)
+            yield replace(message, stamp=message.stamp + round(longer * 1e9))
 
 
 def stamp(t: float) -> int:
