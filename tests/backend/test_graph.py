@@ -5,7 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from uwbslam_jax.backend.graph import Graph
-from uwbslam_jax.measurements import NAN, Scan
+from uwbslam_jax.estimator import Estimate
+from uwbslam_jax.measurements import NAN, Frame, Odometry, Ranges, Scan, ScanMessage, StampedFrame
+from uwbslam_jax.session.frame_assembler import pad_scan
+from uwbslam_jax.settings import LidarSettings, Settings, UwbSettings, make_host_params, make_params
 
 SECOND = 1_000_000_000
 LENGTHS = np.full(40, 3000, np.uint16)
@@ -84,3 +87,26 @@ def test_a_robot_that_rests_under_an_anchor_keeps_its_newest_scans():
         graph._thin()
     assert all(scan is not None for scan in graph.scans[:20])
     assert graph.scans[-1] is not None
+
+
+def test_a_scan_near_a_keyframe_by_wheels_alone_is_a_keyframe(monkeypatch):
+    """Scans a metre apart, wheels in between: every scan that no other was taken near counts, wherever wheels were."""
+    monkeypatch.setattr(Graph, "_tie", lambda graph, host: None)
+    settings = Settings(uwb=UwbSettings(max_beacons=2), lidar=LidarSettings(max_beams=40))
+    host, graph = make_host_params(settings, make_params(settings)), Graph()
+    wall = ScanMessage(0, -1.0, 0.05, 0.0, 0.1, 30.0, np.full(40, 3.0, np.float32))
+    number = np.zeros(4, np.int32)
+    ranges = Ranges(number, number + 1, *np.zeros((3, 4), np.float32), np.zeros(4, bool))
+    odometry = Odometry(np.array([0.1, 0.0, 0.0], np.float32), np.bool_(True))
+    for k in range(41):
+        scan = k % 10 == 0 or k == 21
+        padded = pad_scan(wall if scan else None, settings)
+        frame = StampedFrame(k * SECOND // 10, Frame(np.float32(0.1), np.bool_(scan), padded, ranges, odometry))
+        told = {"pose": np.array([0.1 * k, 0.0, 0.0]), "map_error": np.zeros(3), "velocity": np.zeros(2)}
+        told |= {"matched_pose": told["pose"], "information": np.eye(3) * scan, "yaw_rate": np.zeros(())}
+        told |= {"active": np.ones(3, bool), "moving": np.zeros(3, bool)}
+        graph.add(host, k, frame, Estimate(**{name: told.get(name) for name in Estimate._fields}))
+    seen = np.array([scan is not None for scan in graph.scans])
+    # but not the one that was taken 0.1 m after another
+    np.testing.assert_allclose(graph.poses()[seen, 0], [0.0, 1.0, 2.0, 3.0, 4.0])
+    np.testing.assert_allclose(graph.keyframes["wheels"][1:, 0], np.diff(graph.poses()[:, 0]), atol=1e-6)

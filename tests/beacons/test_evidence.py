@@ -199,3 +199,46 @@ def test_what_is_taken_for_noise_at_first_sight_would_be_found_to_fit(seed, monk
         assert verdict.fits or not noise
     monkeypatch.setattr(s, "_is_noise", lambda *a: [False])
     assert s.judge(resting, known(1.0), 3, np.zeros(2)).fits
+
+
+def heard_in_passes(passes: int, *, place: tuple[float, float] = (3.0, 2.5), since: float = 0.0) -> s.Sightings:
+    """One range a second for six seconds of each minute, while the robot passes on a line that is a little turned each
+    time: too few in the newest 40 s to place a node."""
+    rng, made = np.random.default_rng(3), s.Sightings()
+    for k in range(passes):
+        time = since + 60.0 * k + np.arange(6.0)
+        along, turn = 0.8 * np.arange(6.0), 0.5 * k
+        robot = np.column_stack([1.0 + np.cos(turn) * along, np.sin(turn) * along])
+        distance = np.hypot(*(robot - place).T) + 0.1 * rng.normal(size=6)
+        made.add(np.column_stack([time, np.zeros(6), robot, distance, np.zeros(6)]))
+        made.condense(float(time[-1]))
+    return made
+
+
+def test_a_node_that_is_heard_now_and_then_is_placed_from_several_passes():
+    assert s.resting_place(heard_in_passes(1), known(5.0)) is None
+    found = s.resting_place(heard_in_passes(5), known(245.0))
+    assert found is not None
+    assert np.linalg.norm(found[0].place - [3.0, 2.5]) < 4 * found[0].sigma
+    assert found[0].sigma < 0.15
+
+
+def test_a_node_that_was_put_elsewhere_between_two_passes_is_not_placed_where_it_was():
+    seen, later = heard_in_passes(4), heard_in_passes(2, place=(3.0, -4.0), since=240.0)
+    seen.add(later.since(-np.inf))
+    seen.condense(305.0)
+    found = s.resting_place(seen, known(305.0))
+    assert found is None or np.linalg.norm(found[0].place - [3.0, -4.0]) < 0.5
+
+
+def test_a_long_memory_is_bounded_in_time_and_number_and_moves_with_the_track():
+    made = rows(at_rest, lambda t: np.array([0.8 * t, 0.0]), 900.0, others=())
+    made.condense(900.0)
+    kept = made.since(-np.inf)
+    older = kept[kept[:, s.TIME] < 900.0 - s.MEMORY_S]
+    assert 40 <= len(older) <= 100
+    assert older[0, s.TIME] >= 300.0
+    made.carry(lambda time, places: places + np.array([1.0, 2.0]))
+    np.testing.assert_allclose(made.since(-np.inf)[:, [s.X, s.Y]], kept[:, [s.X, s.Y]] + [1.0, 2.0])
+    made.forget(other=0)  # the robot was carried
+    assert len(made.since(-np.inf)) == 0

@@ -6,6 +6,7 @@ with the ground that was covered.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -184,7 +185,10 @@ class Graph:
         else:
             last = self.keyframes[-1]
             stamps = int(last["stamp"]), frame.stamp
-            far = is_far(pose, last["pose"], stamps[1] - stamps[0], lambda: bool(is_blind(informed)))
+            far = self._is_far(-1, pose, frame.stamp, informed)
+            if not far and _sees(frame) and self.scans[-1] is None:  # wheels alone have been here, no scan has
+                scans = (k for k in range(len(self.scans) - 1, -1, -1) if self.scans[k] is not None)
+                far = all(self._is_far(k, pose, frame.stamp, informed) for k in itertools.islice(scans, 1))
             if self._broken:
                 self.ranges.drop()
             elif far:
@@ -199,6 +203,11 @@ class Graph:
         if self.scans[-1] is not None:
             self._tie(host)
         self._thin()
+
+    def _is_far(self, number: int, pose: np.ndarray, stamp: int, informed: np.ndarray) -> bool:
+        """Whether a pose is far from a keyframe."""
+        key = self.keyframes[number]
+        return is_far(pose, key["pose"], stamp - int(key["stamp"]), lambda: bool(is_blind(informed)))
 
     def _roll(self, frame: StampedFrame) -> None:
         odometry = frame.frame.odometry

@@ -105,7 +105,9 @@ class Sightings:
         for row in (row for early, _ in parts for row in early if row[OTHER] == 0):
             if not kept or np.hypot(row[X] - kept[-1][X], row[Y] - kept[-1][Y]) > _LONG_STEP_M:
                 kept.append(row)
-        kept = [row for row in (kept[::2] if len(kept) > _LONG_MOST else kept) if row[TIME] >= now - _LONG_S]
+        kept = [row for row in kept if row[TIME] >= now - _LONG_S]
+        while len(kept) > _LONG_MOST:
+            kept = kept[::2]
         self._older = np.array(kept).reshape(-1, 6)
 
     def carry(self, move: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> None:
