@@ -13,6 +13,7 @@ from wheel_drive import BEACONS, SCALE, START, driven
 
 from uwbslam_jax.__main__ import main
 from uwbslam_jax.api import run
+from uwbslam_jax.backend import revision
 from uwbslam_jax.files.mcap_log import LogWriter
 from uwbslam_jax.files.run_folder import read_run
 from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage
@@ -131,3 +132,20 @@ class TestWheelsAndRanges:
         assert not result.beacons
         travelled = np.linalg.norm(result.poses[-1, :2] - result.poses[0, :2])
         assert travelled == pytest.approx(np.hypot(wheels[-1].x, wheels[-1].y), abs=1e-3)
+
+
+def test_a_drive_of_which_no_beacon_can_be_placed_ends_in_a_warning() -> None:
+    heard = [m for m in driven(65.0) if not isinstance(m, RangeMessage) or m.target == 3]
+    result = run(heard, SMALL)
+    assert result.summary["decided_at"] is None
+    assert not result.beacons
+    assert [text for _, text in result.summary["events"] if text.startswith("start-up waits: ")]
+    assert [text for text in result.summary["warnings"] if text.startswith("no beacon is placed: fewer than two")]
+
+
+def test_a_run_that_is_sure_of_no_beacon_in_the_end_goes_on_without(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(revision, "SIGMA_ENOUGH_M", 0.0)
+    result = run(driven(20.0), SMALL)
+    assert result.summary["decided_at"] is not None
+    assert not [text for text in result.summary["warnings"] if "could not be solved" in text]
+    assert len(result.beacons) == len(BEACONS)
