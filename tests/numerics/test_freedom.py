@@ -17,22 +17,26 @@ class Made:
     """A problem with some groups open. far: those that are known to be off beyond doubt."""
 
     cost: float
-    far: tuple[str, ...] = ()
+    far: tuple[str, ...]
+    off: Off
 
     def strength(self, group: str) -> float:
         return 1e3 if group in self.far else 0.0
 
 
-def opened(gain, before=(), each=15.0, far=()):
-    """What is left open, and what was tried, where each group gains so much."""
+def opened(gain, before=(), each=15.0, far=(), scale=0.05):
+    """What is left open, and what was tried. gain: of a group, or of the best of several that pass for each other."""
     tried = []
+
+    def made(groups):
+        gains = [most for of, most in gain.items() if set(of.split(" or ")) & set(groups)]
+        return Made(1000.0 - sum(gains), far, Off(np.zeros(6), np.zeros(6), scale))
 
     def attempt(groups, _):
         tried.append(groups)
-        return Made(1000.0 - sum(gain.get(group, 0.0) for group in groups), far)
+        return made(groups)
 
-    first = Made(1000.0 - sum(gain.get(group, 0.0) for group in before), far)
-    return fewest_open(before, first, UNKNOWNS, attempt, each)[0], tried
+    return fewest_open(before, made(before), UNKNOWNS, attempt, each)[0], tried
 
 
 @pytest.mark.parametrize(
@@ -48,6 +52,17 @@ def opened(gain, before=(), each=15.0, far=()):
 )
 def test_a_group_is_left_open_that_pays_for_itself(gain, want):
     assert opened(gain)[0] == want
+
+
+def test_what_others_explain_as_well_is_not_left_open():
+    assert opened({"height or scale": 50.0})[0] == ()
+    assert opened({"height or scale": 50.0, "height": 20.0})[0] == ("height",)
+    assert opened({"height or scale": 50.0}, before=("height",))[0] == ("height",)
+
+
+def test_a_small_scale_is_that_of_the_way():
+    assert opened({"scale": 50.0}, scale=0.008)[0] == ()
+    assert opened({"scale": 50.0, "height": 50.0}, scale=0.008)[0] == ("height",)
 
 
 def test_calibrated_ranges_cost_one_trial_more():

@@ -13,6 +13,12 @@ _PRICE = 3.0
 """Log-likelihood that each unknown of a group has to gain, besides what decides between two explanations."""
 _SURE = 3.0
 """So many times its price a group that is needed costs for certain, however far from linear the problem is."""
+_RIVAL = 5.0
+"""A group is not left open while others explain what it does but for so much log-likelihood: two beacons that stand
+high look like ranges of another scale, and to take the one for the other moves them by metres."""
+_LEAST_SCALE = 0.02
+"""A smaller scale is not that of the ranges but of what tells the way: wheels err by as much, and a map of a building
+bends [m/m]."""
 HEIGHT_START_M = 0.5
 """Where an unknown height starts from at least [m]: at none, a range does not change with it."""
 
@@ -71,10 +77,17 @@ class Off(NamedTuple):
 
 @runtime_checkable
 class Attempt(Protocol):
-    """A problem solved with some groups of unknowns left open. cost: negative log-likelihood."""
+    """A problem solved with some groups of unknowns left open.
+
+    Attributes:
+      cost: negative log-likelihood. off: what was found.
+    """
 
     @property
     def cost(self) -> float: ...
+
+    @property
+    def off(self) -> Off: ...
 
     def strength(self, group: str) -> float:
         """See Off."""
@@ -94,7 +107,7 @@ def fewest_open(
     """The groups that are to be left open, and what is found then.
 
     Each has to pay for itself: all are left open, and then closed again one after the other. Alone, the heights, the
-    scale and the biases may each pass for the others.
+    scale and the biases may each pass for the others: while one may, nothing is left open that was not before.
 
     Args:
       groups, first: those that were found to be off before, and the problem solved with these open.
@@ -107,7 +120,8 @@ def fewest_open(
         return sum((each if group not in groups else 0.0) + _PRICE * unknowns[group] for group in of)
 
     def paid(of: tuple[str, ...]) -> float:
-        return tried[of].cost + price(of)
+        blamed = "scale" in of and abs(tried[of].off.scale) < _LEAST_SCALE
+        return np.inf if blamed else tried[of].cost + price(of)
 
     every = tuple(unknowns)
     tried = {groups: first, every: attempt(every, first)}
@@ -120,6 +134,10 @@ def fewest_open(
             break
         best = better
     best = min(groups, best, key=paid)
+    news = [g for g in best if g not in groups and not _needed(tried[best], g, price)]
+    rivals = [solved.cost for g in news for of, solved in tried.items() if g not in of and paid(of) < np.inf]
+    if min(rivals, default=np.inf) - tried[best].cost < _RIVAL:
+        best = groups
     return best, tried[best]
 
 
