@@ -82,8 +82,8 @@ class Placement:
         nodes = np.array([0, *[1 + b for b in kept]])
         cov = self.cov[np.ix_(columns, columns)]
         slots = [self.slots[b] for b in kept]
-        off = [o._replace(bias=o.bias[nodes], height=o.height[nodes]) for o in (self.off, self.off_sigma)]
-        return Placement(self.poses, slots, self.beacons[kept], self.cost, cov, *off, self.drawn)
+        off, sigma = (o._replace(bias=o.bias[nodes], height=o.height[nodes]) for o in (self.off, self.off_sigma))
+        return Placement(self.poses, slots, self.beacons[kept], self.cost, cov, off, sigma, self.drawn)
 
     def columns(self, *poses: int) -> np.ndarray:
         """Of some poses, given by their number, and of the beacons in the covariance."""
