@@ -224,3 +224,21 @@ def test_from_nearby_fewer_beams_and_moves_find_the_same_place(room_map):
     for pose in found:
         np.testing.assert_allclose(pose, truth, atol=0.01)  # a tenth of a cell, half of what is asked from afar
     assert len(matching.thinned(sweep, 540).valid) < 600
+
+
+def test_a_search_takes_the_place_that_was_expected_and_not_the_last_one_where_walls_tell_neither():
+    corridor = np.array([[[-30.0, -1.05], [30.0, -1.05]], [[30.0, 1.05], [-30.0, 1.05]]])
+    grid, sweep = (
+        drawn(corridor, [(x, 0.0, 0.0) for x in (-3.0, -2.0, -1.0)]),
+        sweep_at((0.0, 0.0, 0.0), walls=corridor),
+    )
+    expected = Gaussian(jnp.zeros(3, jnp.float32), jnp.diag(jnp.array([0.1, 0.1, 1.4], jnp.float32) ** 2))
+    last = jnp.array([-1.0, 0.0, 0.0])
+    view = view_of(sweep)
+    pose = wide_search.search(grid, view, expected, last, jnp.zeros(3), RESOLUTION)
+    assert np.linalg.norm(np.asarray(pose)[:2]) < 0.3
+    assert abs(float(pose[2])) < 0.1
+    # half a turn fits as well: what turns less is taken
+    turned = wide_search.search(grid, view, expected._replace(mean=jnp.array([0.0, 0.0, 0.3])), last, last, RESOLUTION)
+    assert np.linalg.norm(np.asarray(turned)[:2]) < 0.3
+    assert abs(float(turned[2])) < 0.1

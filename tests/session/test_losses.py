@@ -13,7 +13,7 @@ import pytest
 from uwbslam_jax.measurements import RangeMessage, ScanMessage
 from uwbslam_jax.reasons import OdometryLost, RangeLost, ScanLost, Sensor, StartUpLacks
 from uwbslam_jax.session.frame_assembler import FrameAssembler
-from uwbslam_jax.session.losses import blank_scans, losses, unplaced
+from uwbslam_jax.session.losses import blank_scans, losses, unmatched, unplaced
 from uwbslam_jax.session.result_builder import Facts, to_result
 from uwbslam_jax.session.session import Session
 from uwbslam_jax.settings import LidarSettings, MapSettings, Settings
@@ -73,6 +73,14 @@ def test_scans_without_a_return_are_told_where_they_are_most() -> None:
     assert (frames.used[Sensor.SCAN], frames.blank) == (3, 2)
     assert blank_scans(3, 2)[0].startswith("2 of 3 scans hold no return")
     assert not blank_scans(0, 0) + blank_scans(4, 2)
+
+
+def test_scans_that_did_not_fit_the_map_are_told_where_they_are_many() -> None:
+    assert not unmatched(2000, 400, 0.1)
+    assert not unmatched(10, 4, 0.1)
+    (told,) = unmatched(440, 117, 2.433)
+    assert told.startswith("117 of 440 scans")
+    assert "less than 2.4 s apart" in told
 
 
 def test_what_is_not_placed_has_its_own_cause() -> None:

@@ -62,23 +62,29 @@ def search(
         gain = jnp.where(inside, value - 0.5, 0.0).reshape(places.shape[0], -1)
         return jnp.sum(jnp.where(valid, gain, 0.0), axis=1)
 
-    table = lax.map(scores, headings, batch_size=8)  # (headings, places)
+    information = jnp.linalg.inv(expected.cov[:2, :2])
+    directions = jnp.stack([expected.mean[2], last[2]])
+
+    def unlikely(place: Float[Array, "2"], heading: Float[Array, ""]) -> Float[Array, ""]:
+        away = place - expected.mean[:2]
+        turned = wrap_angle(heading - directions) / _TURN
+        return _UNLIKELY * (away @ information @ away + jnp.min(turned**2))
+
+    # or the walls of a corridor, which fit the last place as well, would leave none of the starts to the expected one
+    doubt = jax.vmap(jax.vmap(unlikely, (0, None)), (None, 0))(places, headings)
+    table = lax.map(scores, headings, batch_size=8) / jnp.maximum(jnp.sum(valid), 1) - doubt  # (headings, places)
     best_place = jnp.argmax(table, axis=1)
     value = jnp.max(table, axis=1)
     peak = (value >= jnp.roll(value, 1)) & (value >= jnp.roll(value, -1))
     _, best = lax.top_k(jnp.where(peak, value, -jnp.inf), _SEARCH_REFINED)
     starts = jnp.concatenate([places[best_place[best]], headings[best, None]], axis=1)
     starts = jnp.concatenate([found[None], starts])
-    information = jnp.linalg.inv(expected.cov[:2, :2])
 
     def refine(start: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, ""]]:
         wide = Gaussian(start, jnp.diag(jnp.array([0.3, 0.3, 0.3]) ** 2))
         pose = align(grid, view, start, wide, resolution)
         score, known = fit(grid, sweep, pose, resolution, k)
-        away = pose[:2] - centres[0]
-        turned = wrap_angle(pose[2] - jnp.stack([expected.mean[2], last[2]])) / _TURN
-        unlikely = away @ information @ away + jnp.min(turned**2)
-        return pose, (score - 0.5) * known - _UNLIKELY * unlikely
+        return pose, (score - 0.5) * known - unlikely(pose[:2], pose[2])
 
     poses, values = lax.map(refine, starts)
     pose = poses[jnp.argmax(values)]

@@ -47,6 +47,14 @@ def blank_scans(scans: int, blank: int) -> list[str]:
     return [f"{blank} of {scans} scans hold no return within the limits: {helps}"]
 
 
+def unmatched(scans: int, poor: int, apart: float) -> list[str]:
+    """A line where many of the scans did not fit the map. apart: usual time between two scans [s]."""
+    if poor < FEW or poor <= MANY * scans:
+        return []
+    where = f"{poor} of {scans} scans did not fit the map, and the heading is not known there"
+    return [f"{where}: odometry helps, and scans that are less than {apart:.2g} s apart"]
+
+
 def unplaced(lack: Lack, *, ranges: int, seen: bool) -> str:
     """The line of a run that heard beacons, or should have, and has placed none.
 

@@ -15,7 +15,7 @@ from uwbslam_jax.numerics import turned
 from uwbslam_jax.reasons import Reason, Sensor
 from uwbslam_jax.result import BeaconEstimate, BeaconStatus, Result, RunStatus
 from uwbslam_jax.session.history import History
-from uwbslam_jax.session.losses import blank_scans, losses, unplaced
+from uwbslam_jax.session.losses import blank_scans, losses, unmatched, unplaced
 from uwbslam_jax.session.session import Session
 from uwbslam_jax.session.update import scan_points
 from uwbslam_jax.startup import Relative
@@ -82,6 +82,7 @@ def to_result(session: Session, facts: Facts) -> Result:
     at = slice(None) if kept.all() else np.flatnonzero(kept)  # nothing is copied where it is all of them
     beacons = _beacons(session, session.ids) if facts.relative is None else _relative_beacons(session, facts.relative)
     told = [*losses(facts.used, facts.dropped).values(), *blank_scans(facts.used[Sensor.SCAN], facts.blank)]
+    told += _unmatched(history)
     told += [] if scans else [_NO_SCAN if facts.odometry_used else _NO_TRACK]
     told += [] if facts.relative is None else [_RELATIVE]
     told += [] if beacons else _unplaced(session, facts)
@@ -111,6 +112,15 @@ def to_result(session: Session, facts: Facts) -> Result:
         events=list(history.events),
         summary=_summary(session, facts),
     )
+
+
+def _unmatched(history: History) -> list[str]:
+    """Whether many scans did not fit the map."""
+    scans = history.has_scan.values
+    if scans.sum() < 2:
+        return []
+    apart = float(np.median(np.diff(history.stamps.values[scans]))) / 1e9
+    return unmatched(int(scans.sum()), int(history.diagnostics["poor_match"][scans].sum()), apart)
 
 
 def _residuals(history: History, ids: dict[int, int], start: int) -> np.ndarray:
