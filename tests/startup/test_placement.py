@@ -205,3 +205,15 @@ def test_locate_states_a_place_only_where_there_is_one():
     assert multilateration.locate(near, np.linalg.norm(near - [9.0, 9.0], axis=1), sigma) is None  # not certain enough
     carried = np.linalg.norm(RING - spot, axis=1) + np.array([2.0, -2.0] * 4)
     assert multilateration.locate(RING, carried, sigma) is None  # no one place
+
+
+@pytest.mark.parametrize("away", [1e6, 12.0], ids=["out of the world", "elsewhere"])
+def test_a_beacon_that_slid_away_alone_is_brought_back(away):
+    """Its ranges are outliers there and pull no more: nothing but a look at where they meet finds it."""
+    p = problem()
+    found = p.minimise(truth())
+    beacons = np.vstack([found.beacons[:2], found.beacons[2] + away])
+    lost = replace(found, beacons=beacons, cost=found.cost + 100.0)
+    mended = hypotheses._mended(p, lost, CALIBRATED_M)
+    assert mended.cost < found.cost + 0.1
+    np.testing.assert_allclose(mended.beacons, found.beacons, atol=0.02)

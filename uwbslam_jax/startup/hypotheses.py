@@ -8,12 +8,13 @@ laid on what the track does say, in every way that fits it.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import pairwise, product
 
 import numpy as np
 
-from uwbslam_jax.numerics import multilaterate, rotation_matrix, scaled, soften, turned
-from uwbslam_jax.startup.placement import Placement, Problem
+from uwbslam_jax.numerics import cost_of, multilaterate, rotation_matrix, scaled, soften, turned
+from uwbslam_jax.startup.placement import LAST, Placement, Problem
 
 _ANGLES, _WAYS = 72, 2
 """Angles that are looked at, one every 5 degrees; so many ways of laying the ranges' geometry on the track are tried,
@@ -24,6 +25,9 @@ _SIDES = 3
 """So many choices of the sides are tried."""
 _TRY_ALL, _TRIALS = 10, 16
 """Of more beacons than so many not all choices are looked at, but those that so many random ones lead to."""
+_MENDED, _GAIN = 3, 1.0
+"""So many of the best minima are looked through for a beacon that had better be elsewhere [minima], by so much at least
+[log-likelihood]."""
 _SAME_M = 0.3
 """Beacons closer than this are the same place."""
 
@@ -41,11 +45,42 @@ def explanations(problem: Problem) -> list[Placement]:
     # every start may have slid into one valley: ask the exact mirror images as well
     found += [problem.minimise(beacons, poses) for beacons, poses in problem.images(best)]
     found.sort(key=lambda p: p.cost)
+    found = [*(_mended(problem, p) for p in found[:_MENDED]), *found[_MENDED:]]
+    found.sort(key=lambda p: p.cost)
     distinct: list[Placement] = []
     for placement in found:
         if all(np.mean(placement.apart(other) > _SAME_M) >= 0.5 for other in distinct):
             distinct.append(placement)
     return distinct
+
+
+def _mended(problem: Problem, placement: Placement) -> Placement:
+    """The placement with each beacon that slid into a place of its own, or out of the world, where its ranges to the
+    track and to the other beacons put it: a range that is far off pulls no more."""
+    for _ in problem.slots:
+        best = min(_elsewhere(problem, placement), key=lambda other: other[0])
+        if best[0] > placement.cost - _GAIN:
+            break
+        moved = problem.minimise(best[1], placement.poses, placement.off)
+        if moved.cost > placement.cost - _GAIN:
+            break
+        placement = moved
+    return placement
+
+
+def _elsewhere(problem: Problem, placement: Placement) -> Iterator[tuple[float, np.ndarray]]:
+    """Costs and beacons (B, 2) with one of them at another place."""
+    antenna, ends, pairs = problem.ranges.antenna(placement.poses), problem.pairs.ends, problem.pairs
+    rows = problem.rows(placement.poses[0], LAST)
+    for b in range(len(problem.slots)):
+        mine, first, second = problem.ranges.to == b, ends[:, 0] == b, ends[:, 1] == b
+        anchors = [antenna[mine], placement.beacons[ends[first, 1]], placement.beacons[ends[second, 0]]]
+        distance = [problem.ranges.distance[mine], pairs.flat[first], pairs.flat[second]]
+        sigma = [problem.ranges.sigma[mine], pairs.sigma[first], pairs.sigma[second]]
+        for spot in multilaterate(*map(np.concatenate, (anchors, distance, sigma))):
+            beacons = placement.beacons.copy()
+            beacons[b] = spot
+            yield cost_of(rows, problem.joined(placement.poses, beacons, placement.off)), beacons
 
 
 def track_sides(problem: Problem) -> list[np.ndarray]:

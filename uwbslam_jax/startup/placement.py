@@ -41,6 +41,8 @@ _MOST_MOVES = 20
 _STAGES = (Stage(soft=np.inf, coarse=8.0), Stage(soft=np.inf, coarse=1.0))
 """The problem is solved twice: first a range may err by so many times as much, or where the start is wrong by more than
 the radio errs all its ranges were outliers, and a beacon could as well be anywhere."""
+LAST = _STAGES[-1]
+"""The stage in which costs are compared."""
 _FEWEST_MEANS = 3
 """A beacon ranged less takes no part: so many averages over half an interval between keyframes."""
 _ENOUGH = 0.02
@@ -158,7 +160,7 @@ class Problem(PoseGraph):
         """
         x = self.risen(self.joined(self.track if poses is None else poses, beacons, off))
         x, cost = self.descend(x, _STAGES, moves=_MOST_MOVES, enough=_ENOUGH, damping=1e-3)
-        cov = covariance(self.rows(x[:3], _STAGES[-1]), self.risen(x), self.rank, np.arange(len(x)))
+        cov = covariance(self.rows(x[:3], LAST), self.risen(x), self.rank, np.arange(len(x)))
         poses, beacons, off = self.split(x)
         m = self.first_bias
         sigma = self.off(np.sqrt(np.diag(cov)[m:]))
@@ -175,7 +177,7 @@ class Problem(PoseGraph):
     def keep_unique(self, best: Placement) -> Placement:
         """The placement without the beacons that have a second place which explains the ranges as well."""
         antenna, sigma = self.ranges.antenna(best.poses), best.beacon_sigma()
-        rows = self.rows(best.poses[0], _STAGES[-1])
+        rows = self.rows(best.poses[0], LAST)
         unique = []
         for b in range(len(self.slots)):
             mine = self.ranges.to == b
