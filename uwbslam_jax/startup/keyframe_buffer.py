@@ -100,7 +100,8 @@ class Keyframe:
 
 
 class Sighting(NamedTuple):
-    """One range between the robot and a beacon: time [ns], pose of the track then (3,), distance in the plane [m]."""
+    """One range between the robot and a beacon: time [ns], pose of the track then (3,), distance in the plane [m]. The
+    pose is NaN where neither a scan nor wheels told it: one that goes on with the last velocity is soon a metre off."""
 
     stamp: int
     pose: np.ndarray
@@ -149,7 +150,8 @@ class Buffer:
         pose = np.asarray(estimate.pose, float)
         matched = bool(frame.frame.has_scan) and not bool(estimate.poor)
         self._wheels = rolled_on(self._wheels, frame.frame.odometry)
-        if matched or bool(frame.frame.odometry.valid) or not self.keyframes:
+        told = matched or bool(frame.frame.odometry.valid)
+        if told or not self.keyframes:
             self._latest = Keyframe(
                 frame,
                 pose,
@@ -161,7 +163,8 @@ class Buffer:
             )
             self._keep(self._latest)
         for k in np.flatnonzero(self.host.usable(frame.frame.ranges)):
-            self._add_range(frame, int(k), pose, np.asarray(estimate.velocity, float), float(estimate.yaw_rate))
+            at = pose if told else np.full(3, np.nan)
+            self._add_range(frame, int(k), at, np.asarray(estimate.velocity, float), float(estimate.yaw_rate))
 
     def _keep(self, key: Keyframe) -> None:
         """A keyframe far from the last one; a scan far from the last scan as well, in place of one by wheels alone that
@@ -220,10 +223,13 @@ class Buffer:
         """The robot's ranges averaged over halves of the intervals between keyframes, of one slot each in order."""
         stamps = np.array([key.frame.stamp for key in keys], float)
         poses = np.array([key.pose for key in keys])
-        return [self._average_slot(slot, stamps, poses) for slot in sorted(self.sightings)]
+        known = {
+            slot: [s for s in self.sightings[slot] if s.stamp <= keys[-1].frame.stamp or np.isfinite(s.pose[0])]
+            for slot in sorted(self.sightings)
+        }
+        return [self._average_slot(slot, kept, stamps, poses) for slot, kept in known.items() if kept]
 
-    def _average_slot(self, slot: int, stamps: np.ndarray, poses: np.ndarray) -> TrackRanges:
-        kept = self.sightings[slot]
+    def _average_slot(self, slot: int, kept: list[Sighting], stamps: np.ndarray, poses: np.ndarray) -> TrackRanges:
         stamp = np.array([s.stamp for s in kept], float)
         pose, distance = np.array([s.pose for s in kept]), np.array([s.distance for s in kept])
         at = np.clip(np.searchsorted(stamps, stamp, side="right") - 1, 0, len(stamps) - 1)
@@ -231,7 +237,9 @@ class Buffer:
         share = np.where(after > at, (stamp - stamps[at]) / np.maximum(stamps[after] - stamps[at], 1.0), 0.0)
         share = np.clip(share, 0.0, 1.0)
         antenna = transformed(pose, self.host.antenna)
-        local = [turned(-poses[k, 2], antenna - poses[k, :2]) for k in (at, after)]
+        # what was ranged where nothing told the pose lies evenly between the keyframes
+        told = np.isfinite(pose[:, :1])
+        local = [np.where(told, turned(-poses[k, 2], antenna - poses[k, :2]), self.host.antenna) for k in (at, after)]
         scatter, sigma_n = scatter_along(distance, self.host.sigma_n), self.host.sigma_n
         # two means in each interval: one would leave the keyframes free to move to and fro between their middles
         halves = 2 * at + (share >= 0.5)
@@ -251,8 +259,8 @@ class Buffer:
     def heard(self, slot: int, moved: Moved) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Stamps (R,) [ns], places (R, 2) of the antenna on the moved track and distances (R,) [m] of what was ranged
         to a beacon."""
-        kept = self.sightings[slot]
-        stamps, poses = np.array([s.stamp for s in kept], np.int64), np.array([s.pose for s in kept])
+        kept = [s for s in self.sightings[slot] if np.isfinite(s.pose[0])]
+        stamps, poses = np.array([s.stamp for s in kept], np.int64), np.array([s.pose for s in kept]).reshape(-1, 3)
         return stamps, transformed(moved.carry(stamps, poses), self.host.antenna), np.array([s.distance for s in kept])
 
     def scatter(self, nodes: int) -> np.ndarray:
