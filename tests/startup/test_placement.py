@@ -214,6 +214,6 @@ def test_a_beacon_that_slid_away_alone_is_brought_back(away):
     found = p.minimise(truth())
     beacons = np.vstack([found.beacons[:2], found.beacons[2] + away])
     lost = replace(found, beacons=beacons, cost=found.cost + 100.0)
-    mended = hypotheses._mended(p, lost, CALIBRATED_M)
+    mended = hypotheses._mended(p, lost)
     assert mended.cost < found.cost + 0.1
     np.testing.assert_allclose(mended.beacons, found.beacons, atol=0.02)

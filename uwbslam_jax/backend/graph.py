@@ -117,7 +117,11 @@ class Graph:
 
     def hangs_on(self) -> np.ndarray:
         """(N,) whether a keyframe is known relative to the one before: its scan was matched, or wheels measured."""
-        return np.any(self.keyframes["informed"] != 0, axis=(1, 2)) | self.rolled()
+        return self.matched() | self.rolled()
+
+    def matched(self) -> np.ndarray:
+        """(N,) whether a keyframe's scan was matched with the map."""
+        return np.any(self.keyframes["informed"] != 0, axis=(1, 2))
 
     def rolled(self) -> np.ndarray:
         """(N,) whether wheels measured all the way from the keyframe before."""

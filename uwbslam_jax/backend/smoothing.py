@@ -26,6 +26,7 @@ from uwbslam_jax.numerics import (
     covariance,
     fewest_open,
     median_range,
+    tells_scale,
     widened,
 )
 from uwbslam_jax.settings import Found, HostParams
@@ -183,6 +184,7 @@ class Problem(PoseGraph):
             ranges=ranges,
             pairs=Pairs.of(pairs),
             steady=even_drive(graph),
+            scaled=tells_scale(~graph.blind()[graph.matched()]),
             open=np.array([k for k, slot in enumerate(slots) if slot and not host.surveyed[slot]], int),
             nodes=nodes,
             slots=slots,

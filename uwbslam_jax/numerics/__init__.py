@@ -6,6 +6,7 @@ from uwbslam_jax.numerics.freedom import (
     Freedom as Freedom,
     Off as Off,
     fewest_open as fewest_open,
+    tells_scale as tells_scale,
 )
 from uwbslam_jax.numerics.gaussian import (
     Gaussian as Gaussian,

@@ -19,6 +19,11 @@ high look like ranges of another scale, and to take the one for the other moves 
 _LEAST_SCALE = 0.02
 """A smaller scale is not that of the ranges but of what tells the way: wheels err by as much, and a map of a building
 bends [m/m]."""
+_MOST_SCALE = 0.2
+"""A larger one is no radio's [m/m]."""
+_SEEN = 0.9
+"""A scale is asked for where so much of the way is told in every direction [0 to 1]: along a corridor that scans do not
+see, what they tell is too short, and would pass for ranges that are too long."""
 HEIGHT_START_M = 0.5
 """Where an unknown height starts from at least [m]: at none, a range does not change with it."""
 
@@ -120,7 +125,7 @@ def fewest_open(
         return sum((each if group not in groups else 0.0) + _PRICE * unknowns[group] for group in of)
 
     def paid(of: tuple[str, ...]) -> float:
-        blamed = "scale" in of and abs(tried[of].off.scale) < _LEAST_SCALE
+        blamed = "scale" in of and not _LEAST_SCALE <= abs(tried[of].off.scale) <= _MOST_SCALE
         return np.inf if blamed else tried[of].cost + price(of)
 
     every = tuple(unknowns)
@@ -139,6 +144,15 @@ def fewest_open(
     if min(rivals, default=np.inf) - tried[best].cost < _RIVAL:
         best = groups
     return best, tried[best]
+
+
+def tells_scale(sees: np.ndarray) -> bool:
+    """Whether the way is a measure for ranges: by wheels alone, or by scans that see.
+
+    Args:
+      sees: (N,) whether a scan told its pose in every direction.
+    """
+    return len(sees) == 0 or float(np.mean(sees)) >= _SEEN
 
 
 def _needed(solved: Attempt, group: str, price: Callable[[tuple[str, ...]], float]) -> bool:

@@ -118,6 +118,7 @@ class PoseGraph:
     Attributes:
       count: of the poses. bias_of: (B,) number of each place's node; 0 is the robot's.
       open: (H,) numbers of the nodes whose height nobody has measured. freedom: see there.
+      scaled: whether the way is a measure for the ranges' scale.
       steady: (T, 5) middle one of three poses between which the velocity changes little, time before and after it [s],
         turn on the way [rad], standard deviation of that change [m/s].
     """
@@ -130,6 +131,7 @@ class PoseGraph:
     steady: np.ndarray = field(kw_only=True, default_factory=lambda: np.zeros((0, 5)))
     open: np.ndarray = field(kw_only=True, default_factory=lambda: np.zeros(0, int))
     freedom: Freedom = field(kw_only=True, default_factory=Freedom)
+    scaled: bool = field(kw_only=True, default=True)
 
     def freed(self: AnyGraph, groups: tuple[str, ...]) -> AnyGraph:
         """The problem with some groups of unknowns left open."""
@@ -140,7 +142,7 @@ class PoseGraph:
     @property
     def groups(self) -> dict[str, int]:
         """Unknowns of each group that may be left open."""
-        every = {"height": len(self.open), "scale": 1, "bias": self.first_height - self.first_bias}
+        every = {"height": len(self.open), "scale": int(self.scaled), "bias": self.first_height - self.first_bias}
         return {group: count for group, count in every.items() if count}
 
     @property

@@ -24,9 +24,10 @@ from uwbslam_jax.numerics import (
     median_range,
     multilaterate,
     rotation_matrix,
+    tells_scale,
     wrapped,
 )
-from uwbslam_jax.startup.keyframe_buffer import Buffer, Keyframe
+from uwbslam_jax.startup.keyframe_buffer import Buffer, Keyframe, is_blind
 
 _LOOSE_WHEELS = (0.03, 0.06, 0.02, 0.06)
 """Standard deviation of a step by wheels, see `step_sigma`."""
@@ -131,6 +132,9 @@ class Problem(PoseGraph):
             ranges=TrackRanges(*(np.concatenate(column) for column in zip(*seen, strict=True))),
             pairs=Pairs.of(pairs),
             open=np.array([1 + b for slot, b in index.items() if not buffer.host.surveyed[slot]], int),
+            scaled=tells_scale(
+                np.array([not is_blind(key.information) for key in keys if key.information.any()], bool)
+            ),
             slots=list(index),
             track=np.array([key.pose for key in keys]),
             drawn=max((k for k, key in enumerate(keys) if key.matched), default=len(keys) - 1),
