@@ -201,20 +201,3 @@ def test_what_is_waited_for_has_its_own_words(poses, options, lack) -> None:
 
 def test_a_decided_start_lacks_nothing() -> None:
     assert decide.solve(start_of_run.buffer(start_of_run.with_a_turn()), IDS).lack is None
-
-
-def test_ranges_where_nothing_told_the_pose_lie_evenly_between_scans_and_wait_for_the_next() -> None:
-    kept = Buffer(HOST)
-    kept.add(frame(0, None, scan=True), estimate(np.zeros(3), scan=False))
-    kept.add(frame(int(2e9), None, scan=True), estimate(np.array([2.0, 0.0, 0.0]), scan=True))
-    nowhere = np.full(3, np.nan)
-    stamps = np.array([5e8, 1e9, 15e8, 3e9], int)
-    kept.sightings[1] = deque(start_of_run.Sighting(int(t), nowhere, 5.0) for t in stamps)
-    (means,) = kept.averages(kept.keyframes)
-    np.testing.assert_allclose(means.antenna(np.array([key.pose for key in kept.keyframes]))[:, 0], [0.5, 1.25])
-    kept.sightings[1] = deque([start_of_run.Sighting(int(3e9), nowhere, 5.0)])
-    assert not kept.averages(kept.keyframes)
-    far = frame(int(4e9), None, scan=False)  # the velocity alone tells nothing of where it is
-    r = far.frame.ranges._replace(j=np.full(4, 1, np.int32), range=np.full(4, 5.0), valid=np.ones(4, bool))
-    kept.add(replace(far, frame=far.frame._replace(ranges=r)), estimate(np.array([9.0, 0.0, 0.0]), scan=False))
-    assert np.isnan(kept.sightings[1][-1].pose).all()

@@ -116,8 +116,6 @@ class BeaconKeeper:
         Args:
           stamps: (R,) in order [ns]. antenna: (R, 2) where the robot's was; distance: (R,) in the plane [m].
         """
-        if not len(stamps):
-            return
         time = (stamps - (self._start or 0)) / 1e9
         life, none = self._life(slot), np.zeros(len(stamps))
         life.sightings.add(np.column_stack([time, none, antenna, distance, none]))

@@ -30,8 +30,8 @@ _HEADING_ENOUGH = 0.026
 """Start-up ends when the robot's heading among the beacons is known this well [rad]."""
 _UNDRAWN_HEADING, _UNDRAWN_SIGMA = 0.15, 0.05
 """The same without a map [rad], and for positions as a share of the distance between beacons."""
-_MISFIT = 1.5
-"""Ranges of which half are off by more standard deviations than this do not fit the track: 0.67 is what noise makes."""
+_MISFIT = 3.0
+"""Ranges of which half are off by more standard deviations than this do not fit the track."""
 _UNDRAWN_WAIT_S = 60.0
 """Without a map so long is waited for beacons that are not yet certain: placed together they are placed best."""
 

@@ -100,8 +100,7 @@ class Keyframe:
 
 
 class Sighting(NamedTuple):
-    """One range between the robot and a beacon: time [ns], pose of the track then (3,), distance in the plane [m]. The
-    pose is NaN where neither a scan nor wheels told it: one that goes on with the last velocity is soon a metre off."""
+    """One range between the robot and a beacon: time [ns], pose of the track then (3,), distance in the plane [m]."""
 
     stamp: int
     pose: np.ndarray
@@ -150,8 +149,7 @@ class Buffer:
         pose = np.asarray(estimate.pose, float)
         matched = bool(frame.frame.has_scan) and not bool(estimate.poor)
         self._wheels = rolled_on(self._wheels, frame.frame.odometry)
-        told = matched or bool(frame.frame.odometry.valid)
-        if told or not self.keyframes:
+        if matched or bool(frame.frame.odometry.valid) or not self.keyframes:
             self._latest = Keyframe(
                 frame,
                 pose,
@@ -163,8 +161,7 @@ class Buffer:
             )
             self._keep(self._latest)
         for k in np.flatnonzero(self.host.usable(frame.frame.ranges)):
-            at = pose if told else np.full(3, np.nan)
-            self._add_range(frame, int(k), at, np.asarray(estimate.velocity, float), float(estimate.yaw_rate))
+            self._add_range(frame, int(k), pose, np.asarray(estimate.velocity, float), float(estimate.yaw_rate))
 
     def _keep(self, key: Keyframe) -> None:
         """A keyframe far from the last one; a scan far from the last scan as well, in place of one by wheels alone that
@@ -223,13 +220,10 @@ class Buffer:
         """The robot's ranges averaged over halves of the intervals between keyframes, of one slot each in order."""
         stamps = np.array([key.frame.stamp for key in keys], float)
         poses = np.array([key.pose for key in keys])
-        known = {
-            slot: [s for s in self.sightings[slot] if s.stamp <= keys[-1].frame.stamp or np.isfinite(s.pose[0])]
-            for slot in sorted(self.sightings)
-        }
-        return [self._average_slot(slot, kept, stamps, poses) for slot, kept in known.items() if kept]
+        return [self._average_slot(slot, stamps, poses) for slot in sorted(self.sightings)]
 
-    def _average_slot(self, slot: int, kept: list[Sighting], stamps: np.ndarray, poses: np.ndarray) -> TrackRanges:
+    def _average_slot(self, slot: int, stamps: np.ndarray, poses: np.ndarray) -> TrackRanges:
+        kept = self.sightings[slot]
         stamp = np.array([s.stamp for s in kept], float)
         pose, distance = np.array([s.pose for s in kept]), np.array([s.distance for s in kept])
         at = np.clip(np.searchsorted(stamps, stamp, side="right") - 1, 0, len(stamps) - 1)
@@ -237,9 +231,7 @@ class Buffer:
         share = np.where(after > at, (stamp - stamps[at]) / np.maximum(stamps[after] - stamps[at], 1.0), 0.0)
         share = np.clip(share, 0.0, 1.0)
         antenna = transformed(pose, self.host.antenna)
-        # what was ranged where nothing told the pose lies evenly between the keyframes
-        told = np.isfinite(pose[:, :1])
-        local = [np.where(told, turned(-poses[k, 2], antenna - poses[k, :2]), self.host.antenna) for k in (at, after)]
+        local = [turned(-poses[k, 2], antenna - poses[k, :2]) for k in (at, after)]
         scatter, sigma_n = scatter_along(distance, self.host.sigma_n), self.host.sigma_n
         # two means in each interval: one would leave the keyframes free to move to and fro between their middles
         halves = 2 * at + (share >= 0.5)
@@ -259,8 +251,8 @@ class Buffer:
     def heard(self, slot: int, moved: Moved) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Stamps (R,) [ns], places (R, 2) of the antenna on the moved track and distances (R,) [m] of what was ranged
         to a beacon."""
-        kept = [s for s in self.sightings[slot] if np.isfinite(s.pose[0])]
-        stamps, poses = np.array([s.stamp for s in kept], np.int64), np.array([s.pose for s in kept]).reshape(-1, 3)
+        kept = self.sightings[slot]
+        stamps, poses = np.array([s.stamp for s in kept], np.int64), np.array([s.pose for s in kept])
         return stamps, transformed(moved.carry(stamps, poses), self.host.antenna), np.array([s.distance for s in kept])
 
     def scatter(self, nodes: int) -> np.ndarray:
