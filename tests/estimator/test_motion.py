@@ -196,6 +196,16 @@ def test_a_robot_not_seen_for_long_is_no_less_certain_than_a_robot_can_be(params
     assert np.linalg.eigvalsh(belief.cov / np.outer(std, std)).min() > -1e-6  # float32
 
 
+def test_a_map_errs_by_no_more_than_it_can_and_its_covariance_stays_positive(params):
+    at = np.array(state_vector.map_error_indices(NODES))
+    cov = np.eye(SIZE, dtype=np.float32) * 1e-4
+    cov[at, at] = 1e4
+    after = predict(Gaussian(state(), jnp.asarray(cov)), params, jnp.array(0.1), NONE, RESTING, UNREST)
+    spread = np.sqrt(np.diag(np.asarray(after.cov, float))[at])
+    np.testing.assert_allclose(spread, [5.0, 5.0, 1.0], rtol=1e-3)
+    assert np.linalg.eigvalsh(np.asarray(after.cov, float))[0] > 0
+
+
 def test_the_map_of_a_robot_at_rest_errs_as_before_however_long_it_stands(params):
     """It changes where something is drawn or other ground is seen (trust), not with time."""
     rows = np.array(state_vector.map_error_indices(NODES))

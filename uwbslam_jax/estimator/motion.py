@@ -20,6 +20,9 @@ few milliseconds tells that the stamps are late, not that the robot is fast."""
 _FASTEST = (1.5, 2.0, 2.0)
 """However long the robot was not seen, its velocity, yaw rate and heading are not less certain than this
 [m/s, rad/s, rad]."""
+_WIDEST_MAP = (5.0, 1.0)
+"""Nor does a map err by more [m, rad]: it is drawn where the robot was believed to be. Without a bound a robot that is
+lost among ground of many epochs has a variance beside which float32 loses all the others."""
 
 
 def transition(
@@ -147,9 +150,10 @@ def predict(
 
 
 def _bounded(cov: Float[Array, "n n"], k: int) -> Float[Array, "n n"]:
-    """The robot's velocity, yaw rate and heading at most as uncertain as such a robot's can be."""
+    """The robot's velocity, yaw rate and heading, and the map's error, at most as uncertain as they can be."""
     most = np.zeros(cov.shape[0], np.float32)
     most[[2 * k, 2 * k + 1, 4 * k + 1, 4 * k]] = np.array([_FASTEST[0], *_FASTEST]) ** 2
+    most[[*state_vector.map_error_indices(k)]] = np.array([_WIDEST_MAP[0], *_WIDEST_MAP]) ** 2
     ratio = jnp.where(most > 0, most / jnp.diagonal(cov), 1.0)
     scale = jnp.sqrt(jnp.minimum(1.0, ratio))
     return cov * (scale[:, None] * scale[None, :])
