@@ -38,8 +38,8 @@ def search(
     one of forty.
 
     Args:
-      expected: pose; its position weighs in the choice, its heading does not.
-      last: pose; found: without searching.
+      expected: pose; its position weighs in the choice by its covariance, its heading by `_TURN` however certain.
+      last: pose before this scan; found: pose without searching.
     """
     sweep = view.sweep
     k = middle(grid)

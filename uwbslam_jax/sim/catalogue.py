@@ -244,9 +244,9 @@ def _uwb_silent(seed: int, duration: float | None) -> Scenario:
     return replace(made, uwb=Uwb(silent=((0.4 * made.duration, 0.6 * made.duration),)))
 
 
-def _put_elsewhere(made: Scenario, lasts: float) -> tuple[Path, float]:
-    """A path on which the robot is picked up half way and put down a good part of a lap farther, turned by 120 degrees;
-    and when. lasts: how long it is in somebody's arms [s]."""
+def _put_elsewhere(made: Scenario) -> tuple[Path, float]:
+    """A path on which the robot is picked up half way and put down a good part of a lap farther, turned by 120 degrees,
+    a second later; and when that begins [s]."""
     track = Track(made.world.lap, 1.2, closed=True)
     driven = 0.8 * (made.duration * 7.0 / 15.0 - 6.0)
     first: list[Piece] = [Rest(4.0), Along(track, 0.0, driven)]
@@ -257,20 +257,20 @@ def _put_elsewhere(made: Scenario, lasts: float) -> tuple[Path, float]:
     yaw = before[2] + 2.0 * np.pi / 3.0
     back = (tangent - yaw + np.pi) % (2.0 * np.pi) - np.pi
     rest = 0.8 * max(made.duration - when - 6.0, 1.0)
-    return Path([*first, Carried((x, y, yaw), lasts), Rest(2.0), Turn(back), Along(track, there, there + rest)]), when
+    return Path([*first, Carried((x, y, yaw), 1.0), Rest(2.0), Turn(back), Along(track, there, there + rest)]), when
 
 
 def _kidnapped(seed: int, duration: float | None) -> Scenario:
     """Half way carried elsewhere, unseen by the LiDAR."""
     made = _hall(seed, duration)
-    path, when = _put_elsewhere(made, 1.0)
+    path, when = _put_elsewhere(made)
     return replace(made, path=path, lidar=Lidar(blind=((when, when + 1.0),)))
 
 
 def _gap(seed: int, duration: float | None) -> Scenario:
     """Half way switched off for an hour, in which it is carried elsewhere."""
     made = _hall(seed, duration)
-    path, when = _put_elsewhere(made, 1.0)
+    path, when = _put_elsewhere(made)
     return replace(made, path=path, pause=Pause(when, when + 1.0, 3600.0))
 
 
