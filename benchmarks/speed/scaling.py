@@ -66,7 +66,7 @@ class Case:
     """A run whose beacons are known from the start, stepped with exact measurements."""
 
     def __init__(self, label: int | float, settings: Settings, *, scans: bool = True):
-        self.label, self._scans = label, scans
+        self.label, self.settings, self._scans = label, settings, scans
         config, k = make_config(settings), 1 + settings.uwb.max_beacons
         self._pairs = np.array(list(combinations(range(k), 2)), np.int32)
         self._config: Config = replace(config, max_ranges=len(self._pairs))
