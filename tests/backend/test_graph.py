@@ -49,6 +49,14 @@ def test_a_robot_that_was_carried_from_where_its_scans_hang_together_loses_nothi
     assert len(graph.edges) == 19
 
 
+def test_newest_ground_is_drawn_where_it_matches_though_few_scans_hang_on_it_yet():
+    graph = chain(count=30, tied=20)  # 20 that hang together; ten each on its own
+    for k in range(26, 30):
+        graph.edges.append((k - 1, k, np.array([0.3, 0.0, 0.0]), np.eye(3)))
+    drawn = [round(float(pose[0] / 0.3)) for pose, _ in graph.seen(graph.poses())]
+    assert drawn == [*range(20), *range(25, 30)]
+
+
 def test_a_scan_after_keyframes_without_one_may_be_laid_over_the_last_that_has_one():
     graph = chain(count=9, tied=9)
     for sees in (False, False, True):

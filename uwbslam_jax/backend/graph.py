@@ -137,13 +137,15 @@ class Graph:
     def seen(self, poses: np.ndarray, first: int = 0) -> Iterator[tuple[np.ndarray, Snapshot]]:
         """What may be drawn, from a first keyframe on, at poses (N, 3): scans that hang together with many others.
 
-        A few that hang only on each other were taken where nothing could be told: in somebody's arms, in smoke.
+        A few that hang only on each other were taken where nothing could be told: in somebody's arms, in smoke. Unless
+        they are the newest and match the map: others are yet to come, and the robot stands on this ground.
         """
         count, old, new = len(self.keyframes), self.edges["old"], self.edges["new"]
         tied = sparse.coo_array((np.ones(len(old)), (old, new)), shape=(count, count))
         _, part = sparse.csgraph.connected_components(tied, directed=False)
         size = np.bincount(part, minlength=1)
         kept = size >= min(_HANG_TOGETHER, size.max())
+        kept[part[-1:]] |= self.matched()[-1:]
         drawn = [k for k in np.flatnonzero(kept[part]).tolist() if k >= first and self.scans[k] is not None]
         return ((poses[k], self.snapshot(k)) for k in drawn)
 
