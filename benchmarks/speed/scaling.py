@@ -105,7 +105,7 @@ class Case:
         return time.perf_counter() - begin
 
     def many(self, sets: int, frames: list[Frame]) -> Callable[[], Any]:
-        """The frames stepped for so many parameter sets at once, each with its own noise of ranges."""
+        """The frames stepped for so many parameter sets at once, each with its own noise of ranges; compiled here."""
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *frames)
         params = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (sets, *leaf.shape)), self._params)
         params = params._replace(sigma_n=jnp.linspace(0.05, 0.2, sets))
@@ -115,8 +115,7 @@ class Case:
             state, told = lax.scan(partial(estimator.step, self._config, params), start, stacked)
             return state_vector.robot_pose(state.belief.mean), jnp.sum(told.log_likelihood)
 
-        run = jax.jit(jax.vmap(one))
-        return lambda: run(params)
+        return partial(jax.jit(jax.vmap(one)).lower(params).compile(), params)
 
 
 def _scan(pose: np.ndarray, beams: int) -> Scan:
