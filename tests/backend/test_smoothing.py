@@ -177,7 +177,7 @@ def test_derivatives_agree_with_differences() -> None:
     ranging = host(height=np.array([0.0, 1.0, 0.5, 0.0, 2.0]), bias_scale=0.02)
     graph.keyframes["wheels"][3:8] = between(truth[2:7], truth[3:8])  # so that their scale is an unknown as well
     problem = smoothing.Problem.build(graph, graph.poses(), places, ranging).freed(("bias", "height", "scale"))
-    assert problem.size == 3 * 12 + 8 + 5 + 4 + 3
+    assert problem.size == 3 * 12 + 8 + 5 + 4 + 4
     rng = np.random.default_rng(3)
     x = problem.start(graph.poses() + rng.normal(0, 0.05, truth.shape), places)
     x[-12:] += rng.normal(0, 0.05, 12)

@@ -11,7 +11,7 @@ from uwbslam_jax.backend.final_solution import Hindsight, Question, look_back
 from uwbslam_jax.backend.graph import Graph
 from uwbslam_jax.backend.range_latency import Latency, find_latency, retimed
 from uwbslam_jax.backend.range_means import Node
-from uwbslam_jax.backend.revision import UNSOLVED, Reviser, Revision, is_news, take_over
+from uwbslam_jax.backend.revision import UNSOLVED, Reviser, Revision, is_news, take_over, up_to_date
 from uwbslam_jax.backend.smoothing import Solution
 from uwbslam_jax.estimator import Changes, Estimate, HostView, Moved, SlotEvent, state_vector
 from uwbslam_jax.mapping import Tiles, redraw
@@ -94,6 +94,9 @@ class BackEnd:
             self._reviser.drop()
         revision = self._reviser.look(partial(is_news, state=view.state, graph=self.graph, known=view.found))
         changes = Changes()
+        question = None if revision is None else self._question(view)
+        if revision is not None and question is not None:
+            revision = up_to_date(revision, question, view.state)
         if revision is not None:
             self.taken_over += 1
             changes = self._take_over(view, revision)
@@ -191,4 +194,4 @@ class BackEnd:
         params = self._params(view, found)
         tiles = Tiles(self.settings.map.resolution)
         grid = redraw(view.config, params, tiles, self.graph.seen(solution.poses), self.hindsight.track[-1, :2])
-        return self._take_over(view, Revision(solution, grid, tiles))
+        return self._take_over(view, Revision(solution, grid, tiles, len(solution.poses)))

@@ -12,7 +12,7 @@ import numpy as np
 
 from uwbslam_jax.backend.graph import Graph
 from uwbslam_jax.backend.range_means import Node
-from uwbslam_jax.backend.smoothing import Solution, solve
+from uwbslam_jax.backend.smoothing import Solution, extended, solve
 from uwbslam_jax.estimator import frame_motion, published
 from uwbslam_jax.numerics import between, compose, numeric_jacobian, rigid_fit, transformed, wrapped
 from uwbslam_jax.settings import Found, HostParams
@@ -65,6 +65,14 @@ def framed_solution(question: Question) -> Solution | None:
     """The solution, and its covariance, in the published frame."""
     graph, poses, places, host, frame_nodes, known = question
     solution = solve(graph, poses, places, host, known)
+    return None if solution is None else _framed(solution, poses, frame_nodes)
+
+
+def extended_solution(question: Question, before: Solution) -> Solution | None:
+    """A solution of the run until some time ago with what came since, in the published frame. question: of now, but the
+    poses that it starts from are carried there."""
+    graph, poses, places, host, frame_nodes, _ = question
+    solution = extended(graph, poses, places, host, before)
     return None if solution is None else _framed(solution, poses, frame_nodes)
 
 

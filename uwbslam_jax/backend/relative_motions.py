@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from uwbslam_jax.backend.graph import Graph
-from uwbslam_jax.numerics import Edges, between, turned, wrapped
+from uwbslam_jax.numerics import LIDAR, MAP, WHEELS, Edges, between, turned, wrapped
 from uwbslam_jax.startup import diagonal, loose_sigma, step_sigma
 
 _MATCHED = (0.02, 0.02, 0.01, 0.02)
@@ -47,7 +47,7 @@ def steps(graph: Graph, poses: np.ndarray) -> Edges:
         np.concatenate([z, sure, edges["between"]]),
         np.concatenate(roots),
         np.arange(len(z) + len(sure) + len(edges)) >= len(z),
-        np.append(rolled, np.zeros(len(sure) + len(edges), bool)),
+        np.concatenate([np.where(rolled, WHEELS, MAP), np.full(len(sure), MAP), np.full(len(edges), LIDAR)]),
     )
 
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from uwbslam_jax import process
-from uwbslam_jax.backend.final_solution import Question, framed_solution
+from uwbslam_jax.backend.final_solution import Question, extended_solution, framed_solution
 from uwbslam_jax.backend.graph import Graph
 from uwbslam_jax.backend.smoothing import Solution
 from uwbslam_jax.estimator import State, anchored, state_vector
@@ -48,11 +48,16 @@ _FLOOR_M = 0.01
 
 
 class Revision(NamedTuple):
-    """The run until some keyframe, solved and drawn."""
+    """The run solved and drawn.
+
+    Attributes:
+      drawn: so many keyframes are in grid and tiles.
+    """
 
     solution: Solution
     grid: Grid
     tiles: Tiles
+    drawn: int
 
 
 @dataclass(frozen=True)
@@ -80,7 +85,7 @@ class _Job:
         tiles, graph = Tiles(self.resolution), self.question.graph
         seen = graph.seen(solution.poses)
         grid = redraw(self.config, self.params, tiles, seen, solution.poses[-1, :2], self.epoch)
-        return Revision(solution, grid, tiles)
+        return Revision(solution, grid, tiles, len(solution.poses))
 
 
 @dataclass
@@ -180,30 +185,46 @@ def _differs(solution: Solution, known: Found) -> bool:
     return any(abs(off) > max(least, _NEWS**0.5 * spread) for off, spread, least in pairs)
 
 
+def up_to_date(revision: Revision, question: Question, state: State) -> Revision | None:
+    """A revision with the keyframes that came while it was solved and drawn; None where that cannot be solved.
+
+    They are not hung on the last one that was: what its heading was off by would put them beside their ranges, the
+    farther, the more there are.
+
+    Args:
+      question: what would be solved now.
+    """
+    solution, graph = revision.solution, question.graph
+    slots, places, _ = _current(solution, graph)
+    mean = np.asarray(state_vector.unpack(state.belief.mean).positions, float)
+    among = compose(rigid_fit(mean[slots], places), graph.poses()[len(solution.poses) :])
+    known = question.places | dict(zip(solution.nodes, solution.beacons, strict=True))
+    start = question._replace(poses=np.concatenate([solution.poses, among]), places=known)
+    try:
+        extended = extended_solution(start, solution)
+    except UNSOLVED:
+        return None
+    return None if extended is None else revision._replace(solution=extended)
+
+
 def take_over(config: Config, params: Params, revision: Revision, state: State, graph: Graph) -> State:
-    """The state with pose, beacons and map as a revision has them, carried on to now; the graph's keyframes are moved
+    """The state with pose, beacons and map as a revision has them that is up to date; the graph's keyframes are moved
     with the map."""
-    solution, count = revision.solution, len(revision.solution.poses)
+    solution = revision.solution
     slots, places, at = _current(solution, graph)
     s = state_vector.unpack(state.belief.mean)
     old = np.asarray(state_vector.robot_pose(state.belief.mean), float)
-    on_map = old + np.asarray(s.map_error, float)
-    hangs = graph.hangs_on()
-    firm = int(max(np.flatnonzero(hangs[:count]), default=count - 1))
-    since = np.concatenate([graph.poses()[count:], on_map[None]])
-    carried = compose(solution.poses[firm], between(graph.poses()[firm], since))
-    # a robot that has lost the map is where it is among the beacons, and not where the way since would lead
-    lost = ~np.append(hangs[count:], hangs[-1])
-    if lost.any():
-        among = compose(rigid_fit(np.asarray(s.positions, float)[slots], places), old)
-        carried[lost] = compose(among, between(on_map, since[lost]))
-    poses = np.concatenate([solution.poses, carried[:-1]])
-    seen, way = graph.seen(poses, count), float(state.map_spread.way)
+    lost = not graph.hangs_on()[-1]
+    if lost:  # a robot that has lost the map is where it is among the beacons, and not where the way since would lead
+        pose = compose(rigid_fit(np.asarray(s.positions, float)[slots], places), old)
+    else:
+        on_map = old + np.asarray(s.map_error, float)
+        pose = compose(solution.poses[-1], between(graph.poses()[-1], on_map))
+    seen, way = graph.seen(solution.poses, revision.drawn), float(state.map_spread.way)
     grid = draw_onto(config, params, revision.tiles, revision.grid, seen, way)
-    pose = carried[-1]
     pose[2] = old[2] + wrapped(pose[2] - old[2])
-    cov = _cov(solution, at, pose, float(np.sum(np.hypot(*np.diff(poses[count - 1 :, :2], axis=0).T))))
-    if lost[-1] or firm < count - 1:
+    cov = _cov(solution, at, pose, float(np.hypot(*(pose - solution.poses[-1])[:2])))
+    if lost:
         own = np.array(state_vector.pose_indices(len(s.positions)))
         cov[:3], cov[:, :3] = 0.0, 0.0
         cov[:3, :3] = np.asarray(state.belief.cov, float)[np.ix_(own, own)]
@@ -212,7 +233,7 @@ def take_over(config: Config, params: Params, revision: Revision, state: State, 
     belief = anchored(state.belief, values, cov, slots, others)
     # a buffer of its own: the step donates its state
     spread = state.map_spread._replace(epoch=state.map_spread.way + 0.0)
-    graph.put(poses, 0.0)
+    graph.put(solution.poses, 0.0)
     return state._replace(
         belief=belief,
         grid=grid,

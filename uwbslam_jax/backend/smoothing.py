@@ -96,6 +96,21 @@ def solve(
     return best.solution()
 
 
+def extended(
+    graph: Graph, poses: np.ndarray, places: dict[Node, np.ndarray], host: HostParams, before: Solution
+) -> Solution | None:
+    """A solution with what came since: what ranges are off by stays open where it was, and the start is about right.
+
+    Args: see `solve`. before: the solution of the run until some time ago.
+    """
+    problem = Problem.build(graph, poses, places, host)
+    if problem is None:
+        return None
+    problem = replace(problem, freedom=before.freedom)
+    x = problem.risen(problem.joined(*problem.split(problem.start(poses, places))[:2], problem.known(before.off)))
+    return _Solved(problem, *problem.descend(x, _STAGES[-1:], moves=_MOVES, enough=_ENOUGH)).solution()
+
+
 def _by_the_radio(loud: np.ndarray, to: np.ndarray) -> bool:
     """Whether means (R,) of ranges to places (R,) scatter more than they should wherever the robot is."""
     return bool(np.all(np.bincount(to, loud) > _RADIO * np.bincount(to)))

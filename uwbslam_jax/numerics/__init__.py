@@ -24,6 +24,9 @@ from uwbslam_jax.numerics.multilateration import (
     settle as settle,
 )
 from uwbslam_jax.numerics.pose_graph import (
+    LIDAR as LIDAR,
+    MAP as MAP,
+    WHEELS as WHEELS,
     Edges as Edges,
     Pairs as Pairs,
     PoseGraph as PoseGraph,

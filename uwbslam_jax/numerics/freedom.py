@@ -34,14 +34,15 @@ class Freedom(NamedTuple):
     Attributes:
       bias: of each node's ranges [m]. height: of an antenna that nobody has measured [m].
       scale: of all ranges in proportion to the distance [m/m].
-      wheels, lidar: of the way that wheels tell, and scans [m/m].
+      lidar, wheels, map: of the way that scans tell that are laid over each other, wheels, matches with a map [m/m].
     """
 
     bias: float = CALIBRATED_M
     height: float = 0.0
     scale: float = 0.0
-    wheels: float = 0.0
     lidar: float = 0.0
+    wheels: float = 0.0
+    map: float = 0.0
 
     @staticmethod
     def of(groups: tuple[str, ...]) -> Freedom:
@@ -50,28 +51,30 @@ class Freedom(NamedTuple):
             bias=_OPEN.bias if "bias" in groups else CALIBRATED_M,
             height=_OPEN.height if "height" in groups else 0.0,
             scale=_OPEN.scale if "scale" in groups else 0.0,
-            wheels=_OPEN.wheels if "scale" in groups else 0.0,
             lidar=_OPEN.lidar if "scale" in groups else 0.0,
+            wheels=_OPEN.wheels if "scale" in groups else 0.0,
+            map=_OPEN.map if "scale" in groups else 0.0,
         )
 
 
-_OPEN = Freedom(bias=0.3, height=1.0, scale=0.05, wheels=0.02, lidar=0.002)
+_OPEN = Freedom(bias=0.3, height=1.0, scale=0.05, lidar=0.002, wheels=0.02, map=0.02)
 """Of antenna delays [m], of how much higher than the robot's a beacon's antenna stands [m], of the ranges' scale, the
-wheels' and the LiDAR's [m/m]."""
+LiDAR's, the wheels' and a map's, which bends, and is itself drawn where the ranges say [m/m]."""
 
 
 class Off(NamedTuple):
     """By how much it is off, or how well that is known; S nodes, the robot first.
 
     Attributes:
-      bias, height: (S,) of each node [m]. scale, wheels, lidar: see Freedom [m/m].
+      bias, height: (S,) of each node [m]. scale, lidar, wheels, map: see Freedom [m/m].
     """
 
     bias: np.ndarray
     height: np.ndarray
     scale: float = 0.0
-    wheels: float = 0.0
     lidar: float = 0.0
+    wheels: float = 0.0
+    map: float = 0.0
 
     def strength(self, sigma: Off, group: str) -> float:
         """Log-likelihood that closing a group would cost at least, by how well it is known (Wald's test)."""

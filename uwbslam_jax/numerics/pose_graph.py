@@ -21,13 +21,20 @@ _HELD = 1e-4
 """Standard deviation of the first pose, which is held [m, m, rad]."""
 
 
+WAYS = ("lidar", "wheels", "map")
+"""What measures the way from pose to pose, as Freedom names its scale: two scans laid over each other, wheels, scans
+matched with a map, which bends."""
+LIDAR, WHEELS, MAP = range(len(WAYS))
+"""Their numbers."""
+
+
 class Edges(NamedTuple):
     """Poses relative to older ones, E of them.
 
     Attributes:
       old, new: (E,) numbers of the poses. between: (E, 3) pose of the new one in the frame of the old one.
       roots: (E, 3, 3) of their information, of which each is root.T @ root. soft: (E,) whether one may be an outlier.
-      rolled: (E,) whether wheels have measured it.
+      by: (E,) what has measured it, a number in WAYS.
     """
 
     old: np.ndarray
@@ -35,7 +42,7 @@ class Edges(NamedTuple):
     between: np.ndarray
     roots: np.ndarray
     soft: np.ndarray
-    rolled: np.ndarray
+    by: np.ndarray
 
 
 class TrackRanges(NamedTuple):
@@ -135,7 +142,7 @@ class PoseGraph:
 
     def freed(self: AnyGraph, groups: tuple[str, ...]) -> AnyGraph:
         """The problem with some groups of unknowns left open."""
-        told = {"height": len(self.open) > 0, "wheels": self.edges.rolled.any(), "lidar": not self.edges.rolled.all()}
+        told = {"height": len(self.open) > 0} | {way: bool(np.any(self.edges.by == k)) for k, way in enumerate(WAYS)}
         closed = {name: 0.0 for name, any_of_it in told.items() if not any_of_it}
         return replace(self, freedom=Freedom.of(groups)._replace(**closed))
 
@@ -167,7 +174,7 @@ class PoseGraph:
     @cached_property
     def _scales(self) -> list[str]:
         """Which of the last fields of Freedom and Off are unknowns, in the order of their columns."""
-        return [name for name in ("scale", "wheels", "lidar") if getattr(self.freedom, name)]
+        return [name for name in ("scale", *WAYS) if getattr(self.freedom, name)]
 
     @cached_property
     def spread(self) -> np.ndarray:
@@ -273,11 +280,11 @@ class PoseGraph:
 
     def _add_edges(self, rows: Sink, x: np.ndarray, soft: float, part: slice) -> None:
         poses, _, off = self.split(x)
-        old, new, measured, roots, may_err, rolled = (column[part] for column in self.edges)
+        old, new, measured, roots, may_err, by_what = (column[part] for column in self.edges)
         a, b = poses[old], poses[new]
         moved = between(a, b)
         way = measured * np.array([1.0, 1.0, 0.0])
-        e = moved - (measured + np.where(rolled, off.wheels, off.lidar)[:, None] * way)
+        e = moved - (measured + np.array([getattr(off, name) for name in WAYS])[by_what][:, None] * way)
         e[:, 2] = wrapped(e[:, 2])
         c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
         zero, one = np.zeros_like(c), np.ones_like(c)
@@ -295,8 +302,8 @@ class PoseGraph:
         inside = np.where(may_err, 1.0 + np.sum(white**2, axis=1) / soft**2, 1.0)
         scaled = roots * inside[:, None, None] ** -1.5
         columns = [3 * old, 3 * old + 1, 3 * old + 2, 3 * new, 3 * new + 1, 3 * new + 2]
-        for name, told in (("wheels", rolled), ("lidar", ~rolled)):
-            for column, slope in self._scale_parts(name, -way * told[:, None]):
+        for k, name in enumerate(WAYS):
+            for column, slope in self._scale_parts(name, -way * (by_what == k)[:, None]):
                 by.append(slope)
                 columns.append(column)
         parts = [(column, np.einsum("eij,ej->ei", scaled, d)) for column, d in zip(columns, by, strict=True)]

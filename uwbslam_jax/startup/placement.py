@@ -11,6 +11,8 @@ import numpy as np
 
 from uwbslam_jax.numerics import (
     DECIDED,
+    LIDAR,
+    WHEELS,
     Edges,
     Off,
     Pairs,
@@ -216,7 +218,7 @@ def _steps(keys: list[Keyframe]) -> Edges:
     information = np.array([key.information for key in keys])[new] * told[:, None, None]
     cov = np.linalg.inv(turn @ information @ turn.swapaxes(1, 2) + diagonal(loose**-2))
     roots = np.linalg.cholesky(np.linalg.inv(cov + diagonal(step_sigma(steps, _DRIFT) ** 2))).swapaxes(1, 2)
-    return Edges(old, new, steps, roots, *np.zeros((2, len(new)), bool))
+    return Edges(old, new, steps, roots, np.zeros(len(new), bool), np.where(by_wheels[:, 0], WHEELS, LIDAR))
 
 
 def loose_sigma(steps: np.ndarray, elapsed: np.ndarray, rolled: np.ndarray) -> np.ndarray:
