@@ -17,6 +17,7 @@ from uwbslam_jax.backend.range_means import Node
 from uwbslam_jax.backend.relative_motions import even_drive, steps
 from uwbslam_jax.numerics import (
     CALIBRATED_M,
+    DECIDED,
     Freedom,
     Off,
     Pairs,
@@ -93,7 +94,7 @@ def solve(
     groups = tuple(group for group in problem.groups if getattr(known, group))
     first = problem.freed(groups).minimise(*problem.split(problem.start(poses, places))[:2], problem.known(known))
     _, best = fewest_open(groups, first, problem.groups, lambda groups, before: before.freed(groups))
-    return best.solution()
+    return best.explained().solution()
 
 
 def extended(
@@ -108,7 +109,7 @@ def extended(
         return None
     problem = replace(problem, freedom=before.freedom)
     x = problem.risen(problem.joined(*problem.split(problem.start(poses, places))[:2], problem.known(before.off)))
-    return _Solved(problem, *problem.descend(x, _STAGES[-1:], moves=_MOVES, enough=_ENOUGH)).solution()
+    return problem.settled(x).explained().solution()
 
 
 def _by_the_radio(loud: np.ndarray, to: np.ndarray) -> bool:
@@ -146,6 +147,20 @@ class _Solved:
         """See Off."""
         return self.off.strength(self.off_sigma, group)
 
+    def explained(self) -> _Solved:
+        """Without the poses that their ranges contradict, where the run is explained better so: scans laid over others
+        of the same look hold them there, and no small move leads away. Each is tried between its neighbours."""
+        poses, places, off = self.problem.split(self.x)
+        astray = self.problem.contradicted(self.x)
+        if not astray.any() or astray.all():
+            return self
+        good, every = np.flatnonzero(~astray), np.arange(len(poses))
+        way = np.column_stack([poses[good, :2], np.unwrap(poses[good, 2])])
+        there = np.column_stack([np.interp(every, good, column) for column in way.T])
+        problem = self.problem.evened(astray)
+        again = problem.settled(problem.joined(np.where(astray[:, None], there, poses), places, off))
+        return again if again.cost < self.cost - DECIDED else self
+
     def freed(self, groups: tuple[str, ...]) -> _Solved:
         """Solved with other groups of unknowns left open."""
         poses, places, off = self.problem.split(self.x)
@@ -161,10 +176,12 @@ class _Solved:
 
 @dataclass(frozen=True)
 class Problem(PoseGraph):
-    """The run in arrays: nodes are its places, slots those that have a bias each, the robot's first."""
+    """The run in arrays: nodes are its places, slots those that have a bias each, the robot's first; antenna: (2,) on
+    the robot [m]."""
 
     nodes: list[Node]
     slots: list[int]
+    antenna: np.ndarray
 
     @staticmethod
     def build(graph: Graph, poses: np.ndarray, places: dict[Node, np.ndarray], host: HostParams) -> Problem | None:
@@ -203,7 +220,15 @@ class Problem(PoseGraph):
             open=np.array([k for k, slot in enumerate(slots) if slot and not host.surveyed[slot]], int),
             nodes=nodes,
             slots=slots,
+            antenna=host.antenna,
         )
+
+    def evened(self, astray: np.ndarray) -> Problem:
+        """With the ranges next to poses that are not to be believed (count,) taken on an even way from the pose before
+        to the one after: where the antenna was was told by how far it had come from these."""
+        which = (astray[self.ranges.at] | astray[self.ranges.after])[:, None]
+        at, after = (np.where(which, self.antenna, lever) for lever in (self.ranges.lever_at, self.ranges.lever_after))
+        return replace(self, ranges=self.ranges._replace(lever_at=at, lever_after=after))
 
     def start(self, poses: np.ndarray, places: dict[Node, np.ndarray]) -> np.ndarray:
         """Unknowns to start from: poses (N, 3), places of the nodes, nothing off."""
@@ -213,6 +238,10 @@ class Problem(PoseGraph):
         """Levenberg-Marquardt from poses (N, 3), places (B, 2) and what is off."""
         x = self.risen(self.joined(poses, places, off))
         return _Solved(self, *self.descend(x, _STAGES, moves=_MOVES, enough=_ENOUGH))
+
+    def settled(self, x: np.ndarray) -> _Solved:
+        """At the minimum near unknowns that are about right."""
+        return _Solved(self, *self.descend(x, _STAGES[-1:], moves=_MOVES, enough=_ENOUGH))
 
     def known(self, found: Found) -> Off:
         """By node."""

@@ -27,6 +27,9 @@ matched with a map, which bends."""
 LIDAR, WHEELS, MAP = range(len(WAYS))
 """Their numbers."""
 
+_FAR, _FEWEST_FAR = 3.0, 4
+"""A pose is contradicted where half of its ranges are off by so many standard deviations; of so many at least."""
+
 
 class Edges(NamedTuple):
     """Poses relative to older ones, E of them.
@@ -328,15 +331,31 @@ class PoseGraph:
                 parts += [(3 * k + other, -pull), (3 * (k - 1) + other, pull)]
             rows.add(r, parts)
 
-    def _add_ranges(self, rows: Sink, x: np.ndarray, coarse: float, part: slice) -> None:
+    def contradicted(self, x: np.ndarray) -> np.ndarray:
+        """(count,) whether a pose is not where half of its ranges say, by more than they err."""
+        far = np.abs(self._range_errors(x, slice(None))[0]) > _FAR
+        nearest = np.where(self.ranges.share < 0.5, self.ranges.at, self.ranges.after)
+        every, off = (np.bincount(nearest, some, self.count) for some in (np.ones(len(far)), far))
+        return (every >= _FEWEST_FAR) & (2 * off >= every)
+
+    def _range_errors(self, x: np.ndarray, part: slice) -> tuple[np.ndarray, ...]:
+        """Of some ranges the residual over its standard deviation (n,), and what that depends on: ends (2, n, 2),
+        way from the place (n, 2), difference of the heights (n,), distance (n,)."""
         poses, places, off = self.split(x)
-        some, n = self.ranges.some(part), 3 * self.count
+        some = self.ranges.some(part)
         ends = some.ends(poses)
         u = (1 - some.share)[:, None] * ends[0] + some.share[:, None] * ends[1] - places[some.to]
         rise = some.rise - off.height[self.bias_of[some.to]]
         d = np.maximum(np.sqrt((u**2).sum(1) + rise**2), 1e-6)
+        error = (1.0 + off.scale) * d + off.bias[0] + x[self.bias_column(some.to)] - some.distance
+        return error / some.sigma, np.stack(ends), u, rise, d
+
+    def _add_ranges(self, rows: Sink, x: np.ndarray, coarse: float, part: slice) -> None:
+        poses, _, off = self.split(x)
+        some, n = self.ranges.some(part), 3 * self.count
+        error, ends, u, rise, d = self._range_errors(x, part)
         column, sigma = self.bias_column(some.to), coarse * some.sigma
-        r, scale = soften(((1.0 + off.scale) * d + off.bias[0] + x[column] - some.distance) / sigma)
+        r, scale = soften(error / coarse)
         weight = scale / sigma
         pull = (1.0 + off.scale) * weight
         unit = u / d[:, None]
