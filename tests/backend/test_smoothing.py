@@ -71,6 +71,28 @@ def test_ranges_that_are_wrong_are_left_out() -> None:
     assert beacons.max() < 0.04
 
 
+def test_a_pose_that_all_scans_hold_where_its_ranges_are_not_is_moved_there() -> None:
+    """A scan laid over those before it where it looks alike, and with it the ranges on the way there."""
+    truth, wrong, off = loop(), 60, np.array([0.9, -0.8, 0.0])
+    graph = make(truth)
+    keys, edges, means = graph.keyframes.values, graph.edges.values, graph.ranges.means.values
+    keys["pose"][wrong] += off
+    edges["between"][edges["new"] == wrong] = between(truth[edges["old"][edges["new"] == wrong]], truth[wrong] + off)
+    graph.edges.keep(edges["old"] != wrong)
+    for row in np.flatnonzero(means["at"] == wrong - 1):
+        means["before"][row] += turned(-truth[wrong - 1, 2], off[:2])
+    for row in np.flatnonzero(means["at"] == wrong):
+        means["before"][row] -= turned(-truth[wrong, 2], off[:2])
+    for row in means[np.abs(means["at"] - wrong) <= 1].copy():
+        for _ in range(7):  # as many beacons as it takes to outweigh four scans and steps
+            graph.ranges.means.append(tuple(row))
+    found = solved(graph)
+    robot, beacons = apart(found, truth)
+    assert robot[wrong] < 0.1
+    assert np.sqrt(np.mean(robot**2)) < 0.02
+    assert beacons.max() < 0.03
+
+
 def test_biases_are_found_and_not_invented() -> None:
     truth = loop()
     bias = {0: 0.05, 1: 0.2, 2: -0.15, 3: 0.1, 4: -0.2}

@@ -157,8 +157,14 @@ class _Solved:
         good, every = np.flatnonzero(~astray), np.arange(len(poses))
         way = np.column_stack([poses[good, :2], np.unwrap(poses[good, 2])])
         there = np.column_stack([np.interp(every, good, column) for column in way.T])
-        problem = self.problem.evened(astray)
-        again = problem.settled(problem.joined(np.where(astray[:, None], there, poses), places, off))
+
+        def moved(which: np.ndarray) -> tuple[Problem, np.ndarray]:
+            problem = self.problem.evened(which)
+            return problem, problem.joined(np.where(which[:, None], there, poses), places, off)
+
+        problem, x = moved(astray)
+        problem, x = moved(astray & (self.problem.range_costs(self.x) - problem.range_costs(x) > DECIDED))
+        again = problem.settled(x)
         return again if again.cost < self.cost - DECIDED else self
 
     def freed(self, groups: tuple[str, ...]) -> _Solved:

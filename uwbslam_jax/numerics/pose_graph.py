@@ -27,8 +27,9 @@ matched with a map, which bends."""
 LIDAR, WHEELS, MAP = range(len(WAYS))
 """Their numbers."""
 
-_FAR, _FEWEST_FAR = 3.0, 4
-"""A pose is contradicted where half of its ranges are off by so many standard deviations; of so many at least."""
+_FAR, _FEWEST_FAR, _MANY = 3.0, 3, 0.25
+"""A pose may be contradicted where so many of the ranges around it, and this share, are off by more standard deviations
+than this."""
 
 
 class Edges(NamedTuple):
@@ -332,11 +333,16 @@ class PoseGraph:
             rows.add(r, parts)
 
     def contradicted(self, x: np.ndarray) -> np.ndarray:
-        """(count,) whether a pose is not where half of its ranges say, by more than they err."""
+        """(count,) whether a pose may not be where its ranges say: many are off by more than they err."""
         far = np.abs(self._range_errors(x, slice(None))[0]) > _FAR
         nearest = np.where(self.ranges.share < 0.5, self.ranges.at, self.ranges.after)
         every, off = (np.bincount(nearest, some, self.count) for some in (np.ones(len(far)), far))
-        return (every >= _FEWEST_FAR) & (2 * off >= every)
+        return (off >= _FEWEST_FAR) & (off >= _MANY * every)
+
+    def range_costs(self, x: np.ndarray) -> np.ndarray:
+        """(count,) of each pose the negative log-likelihood of the ranges before and after it."""
+        cost = 0.5 * soften(self._range_errors(x, slice(None))[0])[0] ** 2
+        return sum((np.bincount(end, cost, self.count) for end in (self.ranges.at, self.ranges.after)), np.zeros(1))
 
     def _range_errors(self, x: np.ndarray, part: slice) -> tuple[np.ndarray, ...]:
         """Of some ranges the residual over its standard deviation (n,), and what that depends on: ends (2, n, 2),
