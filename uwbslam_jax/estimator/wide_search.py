@@ -16,9 +16,10 @@ _SEARCH_HEADINGS, _SEARCH_BEAMS, _SEARCH_REFINED = 120, 180, 8
 _UNLIKELY = 0.005
 """What a squared Mahalanobis distance of one costs a searched place, in mean Gamma: as if 100 beams were independent.
 Headings cost little: the search is for a robot that turned."""
-_TURN = 0.6
+_TURN = 0.4
 """A turn that counts as a distance of one [rad]: in real corridors turns of up to 80 degrees between two scans are
-found with it, and scans that would fit turned by half are not."""
+found with it, and scans that would fit turned by half are not: on new ground, of which the map knows little, looking
+back at known walls has to cost more than it gains."""
 
 
 def search(
