@@ -11,6 +11,7 @@ import struct
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -238,24 +239,33 @@ def within_int64(stamp: int) -> int:
 
 def fast_range(options: Options) -> Callable[[bytes, int], list[Message]]:
     """Decoder of UwbRange without the generic machinery: recordings hold hundreds of them a second."""
-    heads = [struct.Struct(order + "iII") for order in "><"]
-    tails = [struct.Struct(order + "IIfff") for order in "><"]
     unit = METRES.get(options.unit, 1.0)
 
     def decode(data: bytes, log_time: int) -> list[Message]:
         try:
             if data[0] or data[1] > 1:
                 raise ValueError("not plain CDR")
-            sec, nanosec, length = heads[data[1]].unpack_from(data, 4)
-            source, target, measured, *powers = tails[data[1]].unpack_from(data, 16 + (length + 3 & ~3))
-            stamp = sec * 1_000_000_000 + nanosec
+            name = len(data) - 36 & ~3  # what the message has room for: nothing comes after it
+            sec, nanosec, length, source, target, measured, *powers = _layout(data[1], name).unpack_from(data, 4)
+            if length + 3 & ~3 != name:
+                layout = _layout(data[1], length + 3 & ~3)
+                sec, nanosec, length, source, target, measured, *powers = layout.unpack_from(data, 4)
         except (struct.error, IndexError, ValueError):
             options.dropped[RangeLost.MALFORMED] += 1
             return []
         metres = measured * options.scale * unit
-        return checked(RangeMessage(stamp, source, target, metres, *powers), options)
+        found = RangeMessage(sec * 1_000_000_000 + nanosec, source, target, metres, *powers)
+        if 0.0 < metres <= options.max_range and metres < math.inf and source != target:
+            return [found]
+        return checked(found, options)
 
     return decode
+
+
+@lru_cache(maxsize=64)
+def _layout(little: int, name: int) -> struct.Struct:
+    """Fields of a UwbRange behind its first four bytes. name: bytes that its frame_id takes, as padded."""
+    return struct.Struct(f"{'><'[little]}iII{name}xIIfff")
 
 
 def checked(found: RangeMessage, options: Options) -> list[Message]:

@@ -138,7 +138,8 @@ class FrameAssembler:
         if scan.ranges.size < 2 or not (math.isfinite(scan.angle_min) and math.isfinite(scan.angle_increment)):
             self.dropped[ScanLost.NO_BEARINGS] += 1
             return []
-        if ((scan.ranges > scan.range_min) & (scan.ranges < scan.range_max)).any():
+        padded = pad_scan(scan, self._settings)
+        if padded.valid.any() or ((scan.ranges > scan.range_min) & (scan.ranges < scan.range_max)).any():
             self._seen_at = scan.stamp
         elif scan.stamp - self._seen_at < _FAILS:
             self.dropped[ScanLost.FAILED] += 1
@@ -149,7 +150,7 @@ class FrameAssembler:
         late = [m for m in self._ranges if m.stamp > scan.stamp]
         ready = [m for m in self._ranges if m.stamp <= scan.stamp]
         self._ranges = late
-        return [*waiting, self._close(scan.stamp, ready, scan)]
+        return [*waiting, self._close(scan.stamp, ready, padded)]
 
     def _add_range(self, message: RangeMessage) -> list[StampedFrame]:
         if not 0.0 < message.range <= self._max_range:
@@ -171,7 +172,6 @@ class FrameAssembler:
         if (a not in self.slots and self._slot(a) is None) or (b not in self.slots and self._slot(b) is None):
             self.dropped[RangeLost.NO_SLOT] += 1
             return []
-        self.used[Sensor.RANGE] += 1
         self._newest_range[pair] = stamp
         self._ranges.append(message)
         # where there is odometry it makes the frames; one that lags is waited for, or they would lack its increment
@@ -262,21 +262,21 @@ class FrameAssembler:
             return _SCANLESS_S
         return min(max(_BLIND_SCANS * float(np.median(self._intervals)) / 1e9, _BLIND_S), _SCANLESS_S)
 
-    def _close(self, stamp: int, ranges: list[RangeMessage], scan: ScanMessage | None) -> StampedFrame:
+    def _close(self, stamp: int, ranges: list[RangeMessage], scan: Scan | None) -> StampedFrame:
         dt = 0.0 if self._last is None else min((stamp - self._last) / 1e9, _LONGEST_S)
         odometry = self._increment(stamp)
         if len(ranges) > self._max_ranges:
             self.dropped[RangeLost.FRAME_FULL] += len(ranges) - self._max_ranges
-            self.used[Sensor.RANGE] -= len(ranges) - self._max_ranges
             ranges = ranges[-self._max_ranges :]
+        self.used[Sensor.RANGE] += len(ranges)
         frame = Frame(
             dt=np.float32(dt),
             has_scan=np.bool_(scan is not None),
-            scan=pad_scan(scan, self._settings),
+            scan=pad_scan(None, self._settings) if scan is None else scan,
             ranges=pad_ranges(ranges, self.slots, stamp, self._max_ranges),
             odometry=odometry,
         )
-        self.blank += scan is not None and not np.count_nonzero(frame.scan.valid)
+        self.blank += scan is not None and not scan.valid.any()
         self._last = stamp
         return StampedFrame(stamp, frame, dict(self.slots))
 
@@ -317,8 +317,8 @@ def pad_scan(scan: ScanMessage | None, settings: Settings) -> Scan:
     stride = -(-scan.ranges.size // beams)
     taken = np.asarray(scan.ranges[::stride], np.float32)
     low, high = max(scan.range_min, settings.lidar.min_range), settings.lidar.max_range
-    ok = (taken >= low) & (taken <= high)  # neither is true of NaN
-    ok &= taken < scan.range_max * (1.0 - _ROUNDING)  # many tell no return as their limit itself, or as inf
+    limit = scan.range_max * (1.0 - _ROUNDING)  # many tell no return as their limit itself, or as inf
+    ok = (taken >= low) & (taken < limit if limit <= high else taken <= high)  # neither is true of NaN
     if low <= 0.0:
         ok &= taken > 0.0
     np.copyto(ranges[: taken.size], taken, where=ok)
