@@ -18,6 +18,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from uwbslam_jax.errors import LogError
 from uwbslam_jax.files import LogWriter, Recording, inspect_log, ros_types
+from uwbslam_jax.files.storage import open_part
 from uwbslam_jax.measurements import Message, RangeMessage, ScanMessage
 
 MS = 1_000_000
@@ -276,3 +277,39 @@ def test_a_compressed_file_that_grows_beyond_reason_is_not_unpacked(
     (tmp_path / "a.mcap.zstd").write_bytes(zstandard.ZstdCompressor().compress(bytes(1 << 24)))
     with pytest.raises(LogError, match=r"a\.mcap\.zstd: unpacks to over"):
         Recording(tmp_path / "a.mcap.zstd")
+
+
+def patched(path: Path, field: bytes, value: int) -> Path:
+    """A ROS 1 bag in whose first header with a field another number of 32 bits stands."""
+    data = path.read_bytes()
+    at = data.index(field + b"=") + len(field) + 1
+    path.write_bytes(data[:at] + value.to_bytes(4, "little") + data[at + 4 :])
+    return path
+
+
+@pytest.mark.parametrize("packed", list(Ros1Writer.CompressionFormat))
+def test_chunks_of_a_ros_1_bag_unpack_to_no_more_than_they_say(tmp_path: Path, packed: Any) -> None:
+    bag = open_part(patched(write_ros1(tmp_path / "a.bag", drive(), packed), b"size", 1000))
+    assert list(bag.records()) == []
+    assert "does not unpack to the size it says" in str(bag.truncated)
+    with pytest.raises(LogError, match=r"a chunk of \d+ bytes says that it unpacks to 2000000000"):
+        open_part(patched(tmp_path / "a.bag", b"size", 2_000_000_000))
+
+
+def test_chunks_of_a_ros_1_bag_do_not_share_an_index(tmp_path: Path) -> None:
+    path, many = write_ros1(tmp_path / "a.bag", drive()), 100
+    data = path.read_bytes()
+    infos = data[_last_record(data) :]
+    path.write_bytes(data + infos * (many - 1))
+    with pytest.raises(LogError, match="its chunks share an index"):
+        open_part(patched(path, b"chunk_count", many))
+
+
+def _last_record(data: bytes) -> int:
+    """Where the last record of a ROS 1 bag begins."""
+    at = last = data.index(b"\n") + 1
+    while at < len(data):
+        last = at
+        for _ in range(2):  # header and content
+            at += 4 + int.from_bytes(data[at : at + 4], "little")
+    return last

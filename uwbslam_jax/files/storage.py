@@ -1,16 +1,14 @@
-"""What else recordings are kept in: ROS 1 bags, ROS 2 bags in SQLite, and any of them compressed as a whole.
+"""What else recordings are kept in: ROS 2 bags in SQLite, and any kind compressed as a whole.
 
-Every kind has the face of `mcap_container.McapFile`. ROS 1 bags are read by rosbags; of SQLite's few tables we read
-what is there, so that a database without its metadata.yaml, or of any age, is a recording too.
+Every kind has the face of `mcap_container.McapFile`; ROS 1 bags are `ros1_bag`. Of SQLite's few tables we read what is
+there, so that a database without its metadata.yaml, or of any age, is a recording too.
 """
 
 from __future__ import annotations
 
 import sqlite3
-import struct
 import tempfile
 import weakref
-import zlib
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing
@@ -18,11 +16,11 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import zstandard
-from rosbags.rosbag1 import Reader, ReaderError
 
 from uwbslam_jax.errors import LogError
 from uwbslam_jax.files.compression import DamagedError, decompress
 from uwbslam_jax.files.mcap_container import MAGIC, Channel, McapFile, RawMessage
+from uwbslam_jax.files.ros1_bag import Ros1Bag
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 """What zstd data begin with [bytes] (RFC 8878); no CDR message does."""
@@ -41,18 +39,6 @@ _PLENTY_BYTES, _MOST_TIMES = 1 << 30, 200
 disk [bytes, ratio]: scans and ranges shrink to a tenth or so."""
 _LARGEST_MESSAGE = 1 << 26
 """A compressed message that unpacks to more is damaged [bytes]."""
-_DAMAGED = (
-    ReaderError,
-    struct.error,
-    AssertionError,
-    RuntimeError,
-    OSError,
-    ValueError,
-    LookupError,
-    EOFError,
-    zlib.error,
-)
-"""What reading a damaged ROS 1 bag raises [exceptions]: rosbags passes on those of struct, bz2 and lz4."""
 _DAMAGED_ROWS = (sqlite3.Error, TypeError, ValueError)
 """What a damaged database raises [exceptions]: a column may also hold another type than it was made for."""
 
@@ -93,7 +79,7 @@ def open_part(path: Path) -> Part:
     if head.startswith(_SQLITE_MAGIC):
         return _Database(path)
     if head.startswith(_ROS1_MAGIC):
-        return _Ros1Bag(path)
+        return Ros1Bag(path)
     packed = next((name for magic, name in _PACKED.items() if head.startswith(magic)), None)
     if packed:
         raise LogError(f"{path}: packed with {packed}, which is not read: unpack it first")
@@ -209,37 +195,3 @@ class _Database:
                     yield RawMessage(int(last), int(number), bytes(memoryview(data)))
         except _DAMAGED_ROWS as error:
             self.truncated = f"recording breaks after {(last - self.start) * 1e-9:.1f} s: {error}"
-
-
-class _Ros1Bag:
-    """A ROS 1 bag, version 2.0."""
-
-    def __init__(self, path: Path):
-        self.path = path
-        self.truncated: str | None = None
-        try:
-            with Reader(path) as bag:
-                self.channels = {c.id: _ros1_channel(c.id, c.topic, c.msgtype, c.msgdef.data) for c in bag.connections}
-                self.counts = Counter({c.id: c.msgcount for c in bag.connections})
-                spoken = bool(self.counts.total())
-                self.start, self.end = (bag.start_time, bag.end_time - 1) if spoken else (0, 0)
-        except _DAMAGED as error:
-            why = " ".join(str(error).split()) or type(error).__name__
-            raise LogError(f"{path}: not a readable ROS 1 bag ({why}): rosbag reindex may mend it") from None
-
-    def records(self, channels: set[int] | None = None) -> Iterator[RawMessage]:
-        """Yields the messages of these channels (all by default) by log time; ends where a chunk is damaged."""
-        last = self.start
-        try:
-            with Reader(self.path) as bag:
-                wanted = [c for c in bag.connections if channels is None or c.id in channels]
-                if wanted:  # none would mean all
-                    for connection, last, data in bag.messages(wanted):
-                        yield RawMessage(last, connection.id, data)
-        except _DAMAGED as error:
-            why = " ".join(str(error).split()) or type(error).__name__
-            self.truncated = f"recording breaks after {(last - self.start) * 1e-9:.1f} s: {why}"
-
-
-def _ros1_channel(number: int, topic: str, schema: str, definition: str) -> Channel:
-    return Channel(number, topic, "ros1", schema, "ros1msg", definition.encode())
