@@ -48,6 +48,13 @@ _ONE_STAMP = "a driver that stamps some messages wrongly"
 """Advice for single stamps [text]."""
 _TWICE, _MERGED = "stamp of the one before", "two recordings of the same were merged, or stamps are whole seconds"
 """Words and advice for a message at the time of the one before [text]."""
+_COPY = "a copy of one before"
+"""Words for a measurement that was heard already [text]."""
+_MERGED_TOO = (
+    "two recordings of the same were merged, two topics carry the same, or both nodes tell of each exchange; each "
+    "counts once"
+)
+"""Advice for copies [text]."""
 _LOOP = "a recording that was played in a loop while it was recorded: its first pass is used"
 """Advice for what comes again [text]."""
 _BYTES = "bytes are damaged or do not fit the type that the recording gives; uwbslam inspect lists the types"
@@ -63,6 +70,7 @@ class ScanLost:
     AGAIN = Reason(Sensor.SCAN, _AGAIN, _LOOP, told=True)
     STAMP = Reason(Sensor.SCAN, "stamp not after the one before", _CLOCK)
     TWICE = Reason(Sensor.SCAN, _TWICE, _MERGED, told=True)
+    COPY = Reason(Sensor.SCAN, _COPY, _MERGED_TOO)
     NO_BEARINGS = Reason(Sensor.SCAN, "no beams or no bearings", "the LiDAR's driver leaves its fields empty")
     NO_BEAMS = Reason(Sensor.SCAN, "no beams", "the LiDAR measures nothing, or its driver leaves the readings out")
     FAILED = Reason(
@@ -97,6 +105,7 @@ class RangeLost:
     SELF = Reason(Sensor.RANGE, "a node to itself", "two radios have one id")
     FROM_SELF = Reason(Sensor.RANGE, "from a node to itself", "two radios have one id, or --robot.id is a beacon's")
     STAMP = Reason(Sensor.RANGE, "stamp not after the pair's one before", _CLOCK)
+    COPY = Reason(Sensor.RANGE, _COPY, _MERGED_TOO)
     LATE = Reason(Sensor.RANGE, "arrived too late", "the radio's clock is behind the LiDAR's; uwbslam inspect shows it")
     NO_SLOT = Reason(
         Sensor.RANGE,
@@ -129,6 +138,7 @@ class OdometryLost:
         told=True,
     )
     TWICE = Reason(Sensor.ODOMETRY, _TWICE, _MERGED, told=True)
+    COPY = Reason(Sensor.ODOMETRY, _COPY, _MERGED_TOO)
     STAMP = Reason(Sensor.ODOMETRY, "stamp not after the one before", _CLOCK)
     MALFORMED = Reason(Sensor.ODOMETRY, "malformed", _BYTES)
 
@@ -149,6 +159,25 @@ class Lack(str):
 
     def __getnewargs__(self) -> tuple[str, str]:
         return str(self), self.advice
+
+
+_SCALE_NEAR = 0.06
+"""Ranges and way so near to a ratio of units are taken to be of these [ratio]."""
+_SCALES = {
+    3.281: "are the ranges in feet? --uwb.unit ft",
+    0.3048: "are the LiDAR's readings, or the wheels' positions, in feet? see their driver",
+    39.37: "are the ranges in inches? --uwb.unit in",
+    0.0254: "are the LiDAR's readings, or the wheels' positions, in inches? see their driver",
+    0.3937: "are the ranges in inches, and were taken for cm? --uwb.unit in",
+    2.54: "are the LiDAR's readings in inches, and were taken for cm? see its driver",
+    2.0: "do the ranges count the way there and back? mend it in the radio's driver, or give --uwb.bias-scale 1",
+    0.5: "are the ranges halved once too often? mend it in the radio's driver, or give --uwb.bias-scale -0.5",
+    100.0: "are the ranges in cm? --uwb.unit cm",
+    0.01: "are the LiDAR's readings, or the wheels' positions, in cm? see their driver",
+    1000.0: "are the ranges in mm? --uwb.unit mm",
+    0.001: "are the LiDAR's readings, or the wheels' positions, in mm? see their driver",
+}
+"""What it likely means that ranges are so many times as long as the way of the robot tells [ratio -> advice]."""
 
 
 class StartUpLacks:
@@ -174,3 +203,10 @@ class StartUpLacks:
         "drive on; scans and wheels that measure turns better, and ranges on both sides, help",
     )
     MORE = Lack("not every beacon is certain yet, and without a map those placed together are placed best", "drive on")
+
+    @staticmethod
+    def scale(factor: float) -> Lack:
+        """That ranges are so many times as long as the track tells."""
+        near = next((advice for ratio, advice in _SCALES.items() if abs(factor / ratio - 1.0) < _SCALE_NEAR), None)
+        other = "in which units are they? see --uwb.unit, and the drivers of radio, LiDAR and wheels"
+        return Lack(f"the ranges are {factor:.3g} times as long as the way of the robot tells", near or other)

@@ -175,7 +175,7 @@ class RangeLayout:
     """Path of the node that it ranges to, "@index" for the place in the list; where not given, the topic names it."""
     range: str = ""
     """Path of the range."""
-    unit: Literal["m", "cm", "mm"] = "m"
+    unit: Literal["m", "cm", "mm", "ft", "in"] = "m"
     """Unit of the range."""
     stamp: str = ""
     """Path of the time: a ROS time, a float of seconds or an integer of nanoseconds; the header's where not given."""
@@ -191,8 +191,8 @@ class UwbSettings:
 
     topic: str = "/uwb/ranges"
     """Topic of the ranges; with * in it, several that are one radio's, such as ``/anchor*/range``."""
-    unit: Literal["auto", "m", "cm", "mm"] = "auto"
-    """Unit of the recorded ranges; auto: what their message says, unless only another one explains them."""
+    unit: Literal["auto", "m", "cm", "mm", "ft", "in"] = "auto"
+    """Unit of the recorded ranges; auto: what their message says, unless only cm or mm explain them."""
     sigma_n: float = 0.1
     """Standard deviation of a range [m]."""
     nlos_gap_db: float = 10.0

@@ -28,6 +28,8 @@ _QUIET_M, _NEAR_M = 0.01, 1.5
 """Millimetres that are so quiet and so short are none: somebody counts centimetres [m]."""
 _LEAST_NOISE_M = 0.002
 """Less noise is that of a simulation or of rounding, and tells nothing [m]."""
+_METRIC = ("m", "cm", "mm")
+"""Units that ranges alone tell: feet and inches are too near to m and cm, only the robot's way tells them."""
 _MOVED_M, _MOVED_NOISES = 0.3, 6.0
 """A pair's ranges change where nine tenths of them spread over so much [m], and so many times their noise."""
 
@@ -85,7 +87,7 @@ class FirstRanges:
             known = noise * metres > _LEAST_NOISE_M
             return told + (math.log(noise * metres / _USUAL_NOISE_M) ** 2 if known else 0.0)
 
-        fitting = [unit for unit in METRES if typical * METRES[unit] / METRES[usual] <= max_range]
+        fitting = [unit for unit in _METRIC if typical * METRES[unit] / METRES[usual] <= max_range]
         return min(fitting, key=odds, default=usual)
 
     def moving(self, metres: float) -> list[tuple[int, int]]:

@@ -22,7 +22,7 @@ from uwbslam_jax.measurements import Message, RangeMessage
 from uwbslam_jax.reasons import RangeLost
 from uwbslam_jax.settings import RangeLayout, UwbSettings
 
-METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048, "in": 0.0254}
 """Length of a unit [m]."""
 _OTHER_NODE = 256
 """Numbers of nodes that a name does not give, and of an anchor that shares the number of the tag that ranges to it:
@@ -55,7 +55,7 @@ class Options:
     max_range: float = 200.0
     scans: ScanReader = field(default_factory=ScanReader)
     dropped: Counter[str] = field(default_factory=Counter)
-    unit: Literal["auto", "m", "cm", "mm"] = "auto"
+    unit: Literal["auto", "m", "cm", "mm", "ft", "in"] = "auto"
     scale: float = 1.0
     whole: bool | None = False
     message: RangeLayout = field(default_factory=RangeLayout)

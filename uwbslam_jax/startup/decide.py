@@ -20,6 +20,7 @@ from uwbslam_jax.settings import Found
 from uwbslam_jax.startup.hypotheses import explanations
 from uwbslam_jax.startup.keyframe_buffer import Buffer
 from uwbslam_jax.startup.placement import Placement, Problem
+from uwbslam_jax.startup.track_scale import wrong_scale
 
 _MOVED_ENOUGH_M = 1.0
 """A robot that has not moved so far is waited for: over less, the noise of the ranges hides the directions [m]."""
@@ -73,6 +74,8 @@ def solve(buffer: Buffer, ids: dict[int, int]) -> Outcome:
     problem = Problem.build(buffer)
     if problem is None:
         return Outcome(RunStatus.PLACING, 0, 0.0, None, StartUpLacks.RANGES)
+    if (apart := wrong_scale(buffer)) is not None:
+        return Outcome(RunStatus.PLACING, 0, 0.0, None, apart)
     problem, found, opened = _explain(problem)
     best = found[0]
     margin = found[1].cost - best.cost if len(found) > 1 else float("inf")
