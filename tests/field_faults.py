@@ -195,6 +195,46 @@ def no_quaternion(row: Row) -> None:
     q.x = q.y = q.z = q.w = 0.0
 
 
+def in_halves(rows: Rows) -> Rows:
+    """Two messages a sweep, as some drivers publish each half turn."""
+    for row in of(rows, SCAN):
+        first, second = row.message, copy.deepcopy(row.message)
+        half = first.ranges.size // 2
+        first.ranges, second.ranges = first.ranges[:half].copy(), second.ranges[half:].copy()
+        second.angle_min = first.angle_min + half * first.angle_increment
+        first.angle_max = second.angle_min - first.angle_increment
+        late = round(half * first.time_increment * S)
+        rows.append(Row(SCAN, row.log + late, second))
+        rows[-1].stamp = row.stamp + late
+    return rows
+
+
+def copied(late: int) -> Fault:
+    """Scans and ranges once more, so much later [ns]."""
+
+    def spoil(rows: Rows) -> Rows:
+        again = copy.deepcopy([row for row in rows if row.topic in (SCAN, UWB)])
+        for row in again:
+            row.log += late
+            row.arrival += late
+        return rows + again
+
+    return spoil
+
+
+def both_ends(rows: Rows) -> Rows:
+    """Both nodes tell of each exchange."""
+    again = copy.deepcopy(of(rows, UWB))
+    for row in again:
+        row.message.source, row.message.target = row.message.target, row.message.source
+        row.arrival += 1
+    return rows + again
+
+
+def nanosec_counts_us(row: Row) -> None:
+    row.stamp -= row.stamp % S - row.stamp % S // 1000
+
+
 def unchanged(rows: Rows) -> Rows:
     return rows
 

@@ -104,7 +104,7 @@ def test_duplicates_are_dropped_and_counted_in_either_direction():
     frames = list(make.frames([ranged(0.0), ranged(0.0), ranged(0.0, 1, 0), scan(0.1), scan(0.1)]))
     assert len(taken(frames)) == 1
     assert make.dropped == {
-        "range: stamp not after the pair's one before": 2,
+        "range: a copy of one before": 2,
         "scan: stamp of the one before": 1,
     }
 

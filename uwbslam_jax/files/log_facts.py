@@ -9,12 +9,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, ScanMessage, TruthMessage
-from uwbslam_jax.session import OdometryTrack
+from uwbslam_jax.session import OdometryTrack, Recent
 
 _PAUSE_S = 10.0
 """Nothing measured for so long is a pause worth a word [s]."""
 _AWAY = 0.2
 """A node that is heard neither in the first nor in the last such share of a recording comes or goes [ratio]."""
+_COPIED = 0.2
+"""Copies of such a share of a sensor's measurements are worth a word [ratio]."""
 _FEW = 20
 """What fewer scans or ranges show is chance [messages]."""
 _OWN_M, _OWN_SPREAD_M, _WORLD_SPREAD_M = 0.7, 0.05, 0.5
@@ -38,6 +40,8 @@ class LogFacts:
     powers: bool = False
     beams: int = 0
     _fewest: int = 0
+    _copies: Counter[str] = field(default_factory=Counter)
+    _recent: Recent = field(default_factory=Recent)
     _heard: dict[int, tuple[int, int]] = field(default_factory=dict)
     _first: int | None = None
     _last: int = 0
@@ -55,6 +59,8 @@ class LogFacts:
     def take(self, messages: list[Message]) -> None:
         """Takes in messages on one clock."""
         for message in messages:
+            if self._is_copy(message):
+                continue
             match message:
                 case RangeMessage():
                     self._take_range(message)
@@ -71,9 +77,29 @@ class LogFacts:
                 self._pauses.append(((self._last - self._first) / 1e9, (message.stamp - self._last) / 1e9))
             self._last = max(self._last, message.stamp)
 
+    def _is_copy(self, message: Message) -> bool:
+        match message:
+            case RangeMessage():
+                kind, of = "ranges", (min(message.source, message.target), max(message.source, message.target))
+            case ScanMessage():
+                kind, of = "scans", (0, 0)
+            case _:
+                return False
+        copy = self._recent.has((kind, of), message.stamp)
+        self._copies[kind] += copy
+        self._recent.add((kind, of), message.stamp)
+        return copy
+
     def notes(self) -> list[str]:
         """What a user should know, one line each."""
         lines = [f"nothing was measured for {long:.1f} s after {after:.1f} s" for after, long in self._pauses[:5]]
+        heard = {"ranges": self.pairs.total(), "scans": self._scans}
+        lines += [
+            f"{count} of {count + heard[kind]} {kind} are copies of one before, and count once: two recordings were "
+            "merged, or both nodes tell of each exchange"
+            for kind, count in self._copies.items()
+            if count > _COPIED * (count + heard[kind])
+        ]
         lines += self._of_nodes() + self._of_scans() + self._wheels.told()
         return lines
 

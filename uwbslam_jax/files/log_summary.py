@@ -161,7 +161,7 @@ def inspect_log(
         beams=heard.beams,
         dropped=options.dropped,
         problems=[*problems, *options.scans.told.values(), *options.told, *names_told(options)],
-        notes=heard.notes(),
+        notes=[*filter(None, [options.scans.noted]), *heard.notes()],
         mounting=read_mounting(recording, roles, options.scans.frame),
         truncated=recording.truncated,
     )

@@ -1,6 +1,6 @@
 """ROS 1 bags, version 2.0, with the face of `mcap_container.McapFile`.
 
-They are read by rosbags, which believes what a file says of its sizes: how much is unpacked and indexed has limits here.
+They are read by rosbags, which believes what a file says of its sizes: what is unpacked and indexed has limits here.
 """
 
 from __future__ import annotations

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from uwbslam_jax.files.sweep_parts import SweepJoiner, in_parts
 from uwbslam_jax.measurements import Message, ScanMessage
 from uwbslam_jax.reasons import ScanLost
 
@@ -84,13 +85,14 @@ _AMISS = {
 @dataclass
 class _Facts:
     """What the first scans of a scanner said, one value each: stamp [ns], time [s] and bearing [rad] from the first
-    reading to the last, what a quarter of the readings is below [m], whether none of them is within its limits."""
+    reading to the last, what a quarter of the readings is below [m], whether none is within its limits, itself."""
 
     stamps: list[int] = field(default_factory=list)
     sweeps: list[float] = field(default_factory=list)
     spans: list[float] = field(default_factory=list)
     nearer: list[float] = field(default_factory=list)
     outside: list[bool] = field(default_factory=list)
+    scans: list[ScanMessage] = field(default_factory=list)
 
     def interval(self) -> float | None:
         """Usual time between scans [s], None where there are too few."""
@@ -107,6 +109,7 @@ class ScanReader:
       frame: frame_id of the scanner that is used; None while none is known.
       frames: messages by frame_id, used or not.
       told: what was found and how it is taken, one line each, by what it is about.
+      noted: what is worth knowing though nothing is wrong, "" for nothing.
     """
 
     def __init__(self, frame: str = ""):
@@ -119,6 +122,8 @@ class ScanReader:
         self._own = _Facts()
         self._last = 0
         self._interval, self._time_scale, self._scale, self._limited = 0.0, 1.0, 1.0, True
+        self.noted = ""
+        self._joiner: SweepJoiner | None = None
         self._equal: Counter[float] = Counter()
         self._no_return: list[float] = []
 
@@ -137,6 +142,11 @@ class ScanReader:
         self.frames.clear()
         self._own = facts.get(self.frame, _Facts())
         self._learn_lengths(self._own)
+        if in_parts(self._own.scans):
+            degrees = math.degrees(float(np.median(self._own.spans)))
+            self._joiner = SweepJoiner()
+            self.noted = f"scans of {degrees:.0f} deg are parts of a sweep, and put together"
+        self._own.scans.clear()
 
     def settle_time(self, rate: float) -> None:
         """Settles what time_increment is given in, once it is known how many times as fast as time stamps pass; 0 where
@@ -182,7 +192,10 @@ class ScanReader:
             limits = (limits[0] * self._scale, limits[1] * self._scale) if limits[1] > _FARTHEST_M else limits
         limits = limits if self._limited else (0.0, math.inf)
         ranges = self._returns(ranges, limits)
-        return [ScanMessage(stamp, bearings.first, bearings.increment, time_increment, *limits, ranges)]
+        scan = ScanMessage(stamp, bearings.first, bearings.increment, time_increment, *limits, ranges)
+        if self._facts is not None:
+            self._facts[frame].scans.append(scan)
+        return [scan] if self._joiner is None else [*self._joiner.take(scan)]
 
     def _is_own(self, frame: str, stamp: int) -> bool:
         """Whether a scan is of the scanner that is used."""

@@ -16,6 +16,8 @@ _LEAST_NS, _PARTS = 500_000_000, 3
 """Over less log time nothing is told [ns]; over each of so many parts a topic's stamps have to pass alike [parts]."""
 _ALIKE, _APART = 2.0, 5.0
 """Rates within the first factor are the same; one that is further than the second from all is none of a clock's."""
+_SMALL_NS, _FEW = 1_000_000, 20
+"""Fractions of a second that are all smaller [ns], of so many messages at least, are no nanoseconds."""
 _UNITS = [10.0**k for k in (-9, -6, -3, 3, 6, 9)]
 """Rates of stamps in other units of time [ratio]."""
 
@@ -52,8 +54,11 @@ def _rate(times: list[tuple[int, int]]) -> float | None:
 
 
 def _whole_seconds(stamps: list[int]) -> bool:
-    """Whether all stamps are whole seconds, of several messages a second."""
-    return len(set(stamps)) > 1 and len(stamps) > 2 * len(set(stamps)) and not any(s % 1_000_000_000 for s in stamps)
+    """Whether all stamps are whole seconds, of several messages a second, or hardly more: then their field of
+    nanoseconds counts microseconds or milliseconds."""
+    seconds = len({stamp // 1_000_000_000 for stamp in stamps})
+    most = 1 if len(stamps) < _FEW else _SMALL_NS
+    return seconds > 1 and len(stamps) > 2 * seconds and all(stamp % 1_000_000_000 < most for stamp in stamps)
 
 
 def _alike(a: float, b: float) -> bool:

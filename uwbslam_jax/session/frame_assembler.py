@@ -31,6 +31,7 @@ from uwbslam_jax.measurements import (
 from uwbslam_jax.numerics import between, wrapped
 from uwbslam_jax.reasons import OdometryLost, RangeLost, ScanLost, Sensor
 from uwbslam_jax.session.odometry_track import OdometryTrack
+from uwbslam_jax.session.recent import Recent
 from uwbslam_jax.settings import Settings, make_config, with_room
 
 _SCANLESS_S = 1.0
@@ -90,6 +91,7 @@ class FrameAssembler:
         self._seldom: Counter[int] = Counter()  # ids without a slot
         self._ranges: list[RangeMessage] = []
         self._newest_range: dict[tuple[int, int], int] = {}
+        self._recent = Recent()
         self._odometry: list[OdometryMessage] = []
         self._last: int | None = None
         self._scan_at: int | None = None
@@ -133,8 +135,10 @@ class FrameAssembler:
             self._intervals.append(scan.stamp - self._scan_at)
         self._scan_at = max(scan.stamp, self._scan_at or scan.stamp)
         if self._last is not None and scan.stamp <= self._last:
-            self.dropped[ScanLost.TWICE if scan.stamp == self._last else ScanLost.STAMP] += 1
+            copy = ScanLost.COPY if self._recent.has(Sensor.SCAN, scan.stamp) else ScanLost.STAMP
+            self.dropped[ScanLost.TWICE if scan.stamp == self._last else copy] += 1
             return []
+        self._recent.add(Sensor.SCAN, scan.stamp)
         if scan.ranges.size < 2 or not (math.isfinite(scan.angle_min) and math.isfinite(scan.angle_increment)):
             self.dropped[ScanLost.NO_BEARINGS] += 1
             return []
@@ -164,7 +168,7 @@ class FrameAssembler:
             return []
         pair = (a, b) if a < b else (b, a)
         if stamp <= self._newest_range.get(pair, -1):
-            self.dropped[RangeLost.STAMP] += 1
+            self.dropped[RangeLost.COPY if self._recent.has(pair, stamp) else RangeLost.STAMP] += 1
             return []
         if self._last is not None and stamp <= self._last - _LATEST - self._latency:
             self.dropped[RangeLost.LATE] += 1
@@ -173,6 +177,7 @@ class FrameAssembler:
             self.dropped[RangeLost.NO_SLOT] += 1
             return []
         self._newest_range[pair] = stamp
+        self._recent.add(pair, stamp)
         self._ranges.append(message)
         # where there is odometry it makes the frames; one that lags is waited for, or they would lack its increment
         patience = _ODOMETRY_LAGS_S if self._odometry else 2 * self._wait_s
@@ -187,9 +192,10 @@ class FrameAssembler:
             self.dropped[OdometryLost.NOT_FINITE] += 1
             return []
         if self._odometry and message.stamp <= self._odometry[-1].stamp:
-            again = message.stamp == self._odometry[-1].stamp
-            self.dropped[OdometryLost.TWICE if again else OdometryLost.STAMP] += 1
+            copy = OdometryLost.COPY if self._recent.has(Sensor.ODOMETRY, message.stamp) else OdometryLost.STAMP
+            self.dropped[OdometryLost.TWICE if message.stamp == self._odometry[-1].stamp else copy] += 1
             return []
+        self._recent.add(Sensor.ODOMETRY, message.stamp)
         self.used[Sensor.ODOMETRY] += 1
         message, joined = self.wheels.join(message)
         if not joined:

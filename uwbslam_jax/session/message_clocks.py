@@ -297,6 +297,9 @@ class MessageClocks:
             found = next((shift for shift in shifts if abs(shift - goal) <= near), None)
             if found is not None:
                 own.shift = found
+                others = [t for t in self._topics.values() if t.known and t.shift == found]
+                if found and all(t.kind is TruthMessage for t in others):  # of which nothing was told
+                    self._apart += told_apart(own, self._reference)
             return found is not None
         for jump in self._jumps[: -1 - _RECENT : -1]:
             if abs(own.shift + jump.change - goal) <= near:

@@ -62,7 +62,8 @@ class TopicClock:
                 "bag play --loop); the repetition is left out"
             )
         if self.rate != 1.0:
-            how = f"pass {self.rate:.3g} times as fast as the log's" if self.rate else "are whole seconds"
+            whole = "are whole seconds (or nanosec counts us or ms)"
+            how = f"pass {self.rate:.3g} times as fast as the log's" if self.rate else whole
             told[self.name, "rate"] = (
                 f"stamps of {self.name} {how}: their log time is taken; are they in another unit (ms, us), or "
                 "a counter of the device?"
