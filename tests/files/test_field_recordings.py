@@ -283,12 +283,13 @@ CASES: dict[str, Case] = {
     "uwb_nanosec_is_us": Case(each(UWB, nanosec_counts_us), near, ("are whole seconds (or nanosec counts us or ms)",)),
     "scan_time_zone": Case(
         each(SCAN, lambda row: row.later(5 * HOUR + HOUR // 2, log=False)),
-        told=("/uwb/ranges are 5.5 h behind those of",),
+        near,
+        ("/uwb/ranges are 5.5 h behind those",),
     ),
     "half_turns": Case(in_halves, near, noted="note: scans of 177 deg are parts of a sweep, and put together"),
     "copies_later": Case(
         copied(S // 5),
-        told=("48 x a copy of one before", "a copy of one before"),
+        told=("49 x a copy of one before", "a copy of one before"),
         noted="are copies of one before",
     ),
     "both_ends_tell": Case(both_ends, told=("a copy of one before",), noted="ranges are copies of one before"),
