@@ -280,11 +280,11 @@ CASES: dict[str, Case] = {
         near,
         ("stamps of /uwb/ranges are whole seconds",),
     ),
-    "uwb_nanosec_is_us": Case(each(UWB, nanosec_counts_us), near, ("are whole seconds (or nanosec counts us or ms)",)),
+    "uwb_nanosec_is_us": Case(each(UWB, nanosec_counts_us), near, ("are whole seconds (or nanosec counts us",)),
     "scan_time_zone": Case(
         each(SCAN, lambda row: row.later(5 * HOUR + HOUR // 2, log=False)),
         near,
-        ("/uwb/ranges are 5.5 h behind those",),
+        ("/uwb/ranges are 5.5 h behind",),
     ),
     "half_turns": Case(in_halves, near, noted="note: scans of 177 deg are parts of a sweep, and put together"),
     "copies_later": Case(

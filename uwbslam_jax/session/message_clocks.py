@@ -43,7 +43,8 @@ _DRIFT = 0.1
 """A log whose time passes otherwise than the stamps by more than this share tells no pauses [1]: it was written later,
 or the recording played at another speed."""
 _BEGIN = 16
-"""Where some of a topic's first so many stamps come again, a recording is played in a loop [messages]."""
+"""Where some of a topic's first so many stamps come again, a recording is played in a loop; so many also tell its usual
+difference to the log time [messages]."""
 _RECENT = 8
 """So many jumps of other topics may be this one's too [jumps]."""
 _LOST: dict[type, type[ScanLost | RangeLost | OdometryLost]] = {
@@ -127,6 +128,8 @@ class MessageClocks:
         own = self._topics.get(topic)
         if own is None:
             own = self._topics[topic] = TopicClock(topic, type(message), rate=self._rates.get(topic, 1.0))
+        if own.drift.rate:
+            message = replace(message, stamp=own.drift.even(message.stamp))
         stamp = message.stamp
         if log_time is not None and log_time < _ABSURD:  # else it is nobody's
             if log_time < self._raw_log - _LOG_BACK:
@@ -146,6 +149,7 @@ class MessageClocks:
                 own.log = log_time
                 if not own.good & _SELDOM:
                     own.follow(_NEAR)
+                    self._watch(own)
             if own.kind is not TruthMessage:
                 self._newest = own
                 if stamp + own.shift > self._out:
@@ -153,6 +157,16 @@ class MessageClocks:
             return [replace(message, stamp=stamp + own.shift) if own.shift else message]
         self._held.append(_Held(message, stamp, log_time, own))
         return list(self._settled(ended=False))
+
+    def _watch(self, own: TopicClock) -> None:
+        """Looks whether a topic's clock runs as fast as the one that all are put on."""
+        reference = self._reference
+        if reference is None or own is reference or own.kind is TruthMessage:
+            return
+        if min(own.good, reference.good) >= _BEGIN:
+            change = own.drift.look(min(own.begin), own.stamp, own.usual - reference.usual)
+            own.stamp += change
+            own.usual += change
 
     def flush(self) -> list[Message]:
         """What still waits, at the end of the messages."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from uwbslam_jax.measurements import RangeMessage, TruthMessage
+from uwbslam_jax.session.clock_drift import ClockDrift
 
 _MANY = 0.2
 """A topic that loses more than this share of its messages is worth a warning [1]."""
@@ -21,6 +22,7 @@ class TopicClock:
       usual: difference of moved stamps to the log time [ns]. known: whether a message was good.
       good, bad, bare, twice: messages, those dropped, those without a stamp, those with the stamp of the one before.
       rate: how many times as fast as the log its stamps pass if they tell no time, 0 if they are whole seconds; else 1.
+      drift: of its clock against that of the others.
       begin: its first stamps. until: those up to it come again; again: so many messages do.
     """
 
@@ -36,6 +38,7 @@ class TopicClock:
     bare: int = 0
     twice: int = 0
     rate: float = 1.0
+    drift: ClockDrift = field(default_factory=ClockDrift)
     begin: set[int] = field(default_factory=set)
     until: int = 0
     again: int = 0
@@ -67,6 +70,12 @@ class TopicClock:
             told[self.name, "rate"] = (
                 f"stamps of {self.name} {how}: their log time is taken; are they in another unit (ms, us), or "
                 "a counter of the device?"
+            )
+        if self.drift.rate:
+            how = f"{100 * abs(self.drift.rate):.2g} % too {'fast' if self.drift.rate > 0 else 'slow'}"
+            told[self.name, "drift"] = (
+                f"the clock of {self.name} runs {how} against the others': its stamps are put on theirs; let its "
+                "driver stamp with the computer's clock"
             )
         if self.bare and self.known:
             told[self.name, "bare"] = (
