@@ -222,6 +222,22 @@ def copied(late: int) -> Fault:
     return spoil
 
 
+def shuffled(rows: Rows) -> Rows:
+    """Logged up to two seconds late, each message for itself."""
+    rng = np.random.default_rng(0)
+    for row in rows:
+        row.log += int(rng.integers(2 * S))
+        row.arrival = row.log
+    return rows
+
+
+def in_bursts(rows: Rows) -> Rows:
+    """Scans over a network that lets go once a second."""
+    for row in of(rows, SCAN):
+        row.log = row.arrival = row.log // S * S + S
+    return rows
+
+
 def both_ends(rows: Rows) -> Rows:
     """Both nodes tell of each exchange."""
     again = copy.deepcopy(of(rows, UWB))

@@ -8,9 +8,11 @@ from dataclasses import dataclass
 
 from uwbslam_jax.errors import LogError
 from uwbslam_jax.files.bag import Bag, Source
+from uwbslam_jax.files.first_look import look_first
 from uwbslam_jax.files.first_ranges import look_ahead
 from uwbslam_jax.files.log_facts import LogFacts
-from uwbslam_jax.files.mcap_log import choose_topics, look_first
+from uwbslam_jax.files.log_order import StampOrder, told as told_late
+from uwbslam_jax.files.mcap_log import choose_topics
 from uwbslam_jax.files.mounting import Mounting, read_mounting
 from uwbslam_jax.files.range_messages import Options, names_told
 from uwbslam_jax.files.schemas import Decoder, Role
@@ -134,19 +136,27 @@ def inspect_log(
                 problems.append(f"no {role} topic")
         except LogError as error:
             problems.append(str(error))
-    rates = look_first(recording, decoders, roles, options)
+    look = look_first(recording, decoders, roles, options)
+    order = StampOrder(look.late) if look.late is not None else None
+    problems += [told_late(look.late)] if look.late is not None else []
     ranges = {number: decode for number, decode in decoders.items() if roles[number] == "uwb"}
     look_ahead(recording, ranges, options, scans=bool({"scan", "odom"} & set(roles.values())))
     topic_of = {channel.id: channel.topic for channel in recording.channels.values()}
     clocks = {topic: _Clock() for topic in topic_of.values()}
-    heard, on_clock = LogFacts(), MessageClocks(options.dropped, rates)
+    heard, on_clock = LogFacts(), MessageClocks(options.dropped, look.rates)
     for log_time, number, data in recording.records():
         if number not in topic_of:
             continue
         clocks[topic_of[number]].tick(log_time)
         if number in decoders:
             for message in decoders[number](data, log_time):
-                heard.take(on_clock.take(message, log_time, topic_of[number]))
+                if order is None:
+                    heard.take(on_clock.take(message, log_time, topic_of[number]))
+                else:
+                    for logged in order.take(message, log_time, topic_of[number]):
+                        heard.take(on_clock.take(*logged))
+    for logged in order.flush() if order is not None else ():
+        heard.take(on_clock.take(*logged))
     heard.take(on_clock.flush())
     problems += on_clock.warnings
     return LogSummary(

@@ -18,13 +18,14 @@ from types import TracebackType
 from uwbslam_jax.errors import LogError as LogError
 from uwbslam_jax.evaluation import Truth
 from uwbslam_jax.files.bag import Bag, Source
+from uwbslam_jax.files.first_look import look_first
 from uwbslam_jax.files.first_ranges import look_ahead
+from uwbslam_jax.files.log_order import StampOrder, told as told_late
 from uwbslam_jax.files.mcap_container import Channel, RecordWriter
 from uwbslam_jax.files.mounting import Mounting, read_mounting
 from uwbslam_jax.files.pose_messages import odometry_parts
 from uwbslam_jax.files.range_messages import Options, names_told
 from uwbslam_jax.files.ros_types import definition, encode
-from uwbslam_jax.files.scan_messages import FIRST_LOOK
 from uwbslam_jax.files.schemas import (
     Decoder,
     Role,
@@ -34,7 +35,6 @@ from uwbslam_jax.files.schemas import (
     plausible,
     unpacker,
 )
-from uwbslam_jax.files.stamp_rates import stamp_rates
 from uwbslam_jax.measurements import Message, OdometryMessage, RangeMessage, ScanMessage, TruthMessage
 from uwbslam_jax.session import MessageClocks
 from uwbslam_jax.settings import UwbSettings
@@ -97,10 +97,10 @@ class Recording:
         except LogError as error:
             broken = f"; {self._recording.truncated}" if self._recording.truncated else ""
             raise LogError(f"{self.name}: {' '.join(str(error).split())}{broken}") from None
-        self._rates = look_first(self._recording, self._decoders, self._roles, self._options)
+        self._look = look_first(self._recording, self._decoders, self._roles, self._options)
         channels = self._recording.channels
         self.topics: dict[str, Role] = {channels[number].topic: role for number, role in self._roles.items()}
-        self._warnings: list[str] = []
+        self._warnings = [told_late(self._look.late)] if self._look.late is not None else []
         self._of_clocks: list[str] = []
         if uwb_topic is not None and "uwb" not in self._roles.values():
             self._warnings.append(f"no UWB topic: {'LiDAR' if 'scan' in self._roles.values() else 'odometry'} only")
@@ -137,12 +137,12 @@ class Recording:
     def truth(self) -> Truth | None:
         """Where robot and beacons were, None where the recording has no truth of the robot; read through for it."""
         wanted = {number: decode for number, decode in self._decoders.items() if self._roles[number] == "truth"}
-        poses = [m for m in self._timed(MessageClocks(rates=self._rates), wanted) if isinstance(m, TruthMessage)]
+        poses = [m for m in self._timed(MessageClocks(rates=self._look.rates), wanted) if isinstance(m, TruthMessage)]
         return Truth.from_messages(poses) if any(m.node is None for m in poses) else None
 
     def __iter__(self) -> Iterator[Message]:
         self._options.dropped.clear()
-        clocks = MessageClocks(self._options.dropped, self._rates)
+        clocks = MessageClocks(self._options.dropped, self._look.rates)
         self._of_clocks = []
         yield from self._timed(clocks, self._decoders)
         self._of_clocks = clocks.warnings
@@ -150,10 +150,17 @@ class Recording:
     def _timed(self, clocks: MessageClocks, decoders: dict[int, Decoder]) -> Iterator[Message]:
         """Messages of some channels, on one clock."""
         channels = {n: (decode, self._recording.channels[n].topic) for n, decode in decoders.items()}
+        order = StampOrder(self._look.late) if self._look.late is not None else None
         for log_time, number, data in self._recording.records(set(decoders)):
             decode, topic = channels[number]
             for message in decode(data, log_time):
-                yield from clocks.take(message, log_time, topic)
+                if order is None:
+                    yield from clocks.take(message, log_time, topic)
+                else:
+                    for logged in order.take(message, log_time, topic):
+                        yield from clocks.take(*logged)
+        for logged in order.flush() if order is not None else ():
+            yield from clocks.take(*logged)
         yield from clocks.flush()
 
 
@@ -182,20 +189,6 @@ def choose_topics(
         if channel.id not in decoders and (decoder := _truth_decoder(channel, options)) is not None:
             decoders[channel.id], roles[channel.id] = decoder, "truth"
     return decoders, roles
-
-
-def look_first(
-    recording: Bag, decoders: dict[int, Decoder], roles: dict[int, Role], options: Options
-) -> dict[str, float]:
-    """Reads the first messages: scans tell how their driver means the rest. What `stamp_rates` tells is returned."""
-    scans = {number for number, role in roles.items() if role == "scan" and recording.counts[number]}
-    for log_time, number, data in islice(recording.records(scans) if scans else (), FIRST_LOOK):
-        decoders[number](data, log_time)
-    options.scans.settle()
-    rates = stamp_rates(recording, decoders)
-    options.scans.settle_time(min((rates.get(recording.channels[number].topic, 1.0) for number in scans), default=1.0))
-    options.dropped.clear()
-    return rates
 
 
 def _discover(recording: Bag, role: Role, options: Options) -> dict[int, Decoder]:

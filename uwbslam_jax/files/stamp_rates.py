@@ -3,15 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
-from uwbslam_jax.files.bag import Bag
-from uwbslam_jax.files.schemas import Decoder
-
-_LOOK_NS, _LOOK_MESSAGES = 3_000_000_000, 4000
-"""So much of a recording's beginning is looked at [ns, messages]."""
 _LEAST_NS, _PARTS = 500_000_000, 3
 """Over less log time nothing is told [ns]; over each of so many parts a topic's stamps have to pass alike [parts]."""
 _ALIKE, _APART = 2.0, 5.0
@@ -22,19 +16,14 @@ _UNITS = [10.0**k for k in (-9, -6, -3, 3, 6, 9)]
 """Rates of stamps in other units of time [ratio]."""
 
 
-def stamp_rates(recording: Bag, decoders: Mapping[int, Decoder]) -> dict[str, float]:
+def stamp_rates(seen: Mapping[str, Sequence[tuple[int, int]]]) -> dict[str, float]:
     """Topics whose stamps tell no time, and how many times as fast as the log's they pass, 0 for whole seconds.
 
     Where no topic keeps pace with the log, it is the log that was written later: then only other units are told.
+
+    Args:
+      seen: stamps and log times of the first messages by topic [ns].
     """
-    topics = {number: recording.channels[number].topic for number in decoders}
-    seen: defaultdict[str, list[tuple[int, int]]] = defaultdict(list)
-    first, count = 0, 0
-    for log_time, number, data in recording.records(set(decoders)):
-        first, count = first or log_time, count + 1
-        if log_time - first > _LOOK_NS or count > _LOOK_MESSAGES:
-            break
-        seen[topics[number]] += [(m.stamp, log_time) for m in decoders[number](data, log_time) if m.stamp > 0]
     rates = {topic: rate for topic, times in seen.items() if (rate := _rate(times)) is not None}
     whole = {topic: 0.0 for topic, times in seen.items() if _whole_seconds([stamp for stamp, _ in times])}
     kept = any(1 / _ALIKE < rate < _ALIKE for rate in rates.values())
@@ -42,7 +31,7 @@ def stamp_rates(recording: Bag, decoders: Mapping[int, Decoder]) -> dict[str, fl
     return {t: rate for t, rate in wrong.items() if kept or any(_alike(rate, unit) for unit in _UNITS)} | whole
 
 
-def _rate(times: list[tuple[int, int]]) -> float | None:
+def _rate(times: Sequence[tuple[int, int]]) -> float | None:
     """How many times as fast stamps pass as log times [ns] do; None where too few tell, or they do not pass evenly."""
     at = [times[k * (len(times) - 1) // _PARTS] for k in range(_PARTS + 1)] if times else []
     parts = [(b[0] - a[0], b[1] - a[1]) for a, b in pairwise(at)]
