@@ -88,3 +88,9 @@ def test_a_restart_after_a_pause_begins_a_new_track() -> None:
 def test_millimetres_are_told_as_such() -> None:
     _, _, track = joined(messages(drive(TIMES) * (1000.0, 1000.0, 1.0), TIMES))
     assert "are its positions in m" in track.told()[0]
+
+
+def test_of_positions_in_centimetres_no_increment_is_left() -> None:
+    _, ok, track = joined(messages(drive(TIMES) * [100.0, 100.0, 1.0], TIMES))
+    assert not ok[10:].any()
+    assert "are its positions in m" in track.told()[0]

@@ -31,6 +31,8 @@ _RECENT = 20
 """Increments that tell how fast the robot is [increments]."""
 _HOLD_S = 0.3
 """Over a jump the motion is taken to go on as before, for so long [s]; over a longer one there is no increment."""
+_OFTEN = 5
+"""After more jumps among the recent increments, none is worth anything [increments]: positions in other units."""
 _NEARLY_ALL = 0.2
 """Share of increments that are jumps from which on they are no restarts."""
 
@@ -49,6 +51,7 @@ class OdometryTrack:
         self._out: OdometryMessage | None = None
         self._intervals: deque[float] = deque(maxlen=_RECENT)
         self._speeds: deque[Pair] = deque(maxlen=_RECENT)
+        self._jumped: deque[bool] = deque(maxlen=_RECENT)
         self._velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
         self._suspect: Pair = (0.0, 0.0)
         self._fastest: Pair = (0.0, 0.0)
@@ -70,7 +73,9 @@ class OdometryTrack:
         span = max(dt, usual)
         size = math.hypot(dx, dy), abs(dyaw)
         joined = True
-        if self._is_jump(message, size, span, paused=dt > _SILENT * usual):
+        jump = self._is_jump(message, size, span, paused=dt > _SILENT * usual)
+        self._jumped.append(jump)
+        if jump:
             self.jumps += 1
             self._first_jump = self._first_jump or message.stamp
             self._suspect = size[0] / span, size[1] / span
@@ -86,7 +91,7 @@ class OdometryTrack:
             self._fastest = max(self._fastest[0], speed[0]), max(self._fastest[1], speed[1])
             self._velocity = forward / span, left / span, turn / span
         self._out = _onward(out, (forward, left, turn), message.stamp) if self.jumps else message
-        return self._out, joined
+        return self._out, joined and sum(self._jumped) <= _OFTEN
 
     def _is_jump(self, message: OdometryMessage, size: Pair, span: float, *, paused: bool) -> bool:
         """Whether a step of a size [m, rad] in a time [s] is none that a robot makes."""
