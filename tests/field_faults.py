@@ -238,6 +238,14 @@ def in_bursts(rows: Rows) -> Rows:
     return rows
 
 
+def on_other_topics_too(rows: Rows) -> Rows:
+    """A filtered scan, and a second program that publishes the radio's ranges."""
+    again = copy.deepcopy([row for row in rows if row.topic in (SCAN, UWB)])
+    for row in again:
+        row.topic += "_again"
+    return rows + again
+
+
 def both_ends(rows: Rows) -> Rows:
     """Both nodes tell of each exchange."""
     again = copy.deepcopy(of(rows, UWB))

@@ -33,6 +33,7 @@ from field_faults import (
     no_quaternion,
     no_stamp_at_first,
     of_the_robot,
+    on_other_topics_too,
     one,
     own_posts,
     readings,
@@ -290,6 +291,15 @@ CASES: dict[str, Case] = {
     ),
     "log_shuffled": Case(shuffled, told=("s late and out of order",)),
     "scans_in_bursts": Case(in_bursts, told=("s late and out of order",)),
+    "on_other_topics_too": Case(
+        on_other_topics_too,
+        told=("/scan_again holds scans too and is left out", "/uwb/ranges_again holds ranges too and is left out"),
+    ),
+    "scans_end": Case(
+        lambda rows: [r for r in rows if r.topic != SCAN or r.stamp < HALF],
+        fewer_scans,
+        noted="note: scans end after 2.4 s",
+    ),
     "half_turns": Case(in_halves, near, noted="note: scans of 177 deg are parts of a sweep, and put together"),
     "copies_later": Case(
         copied(S // 5),

@@ -13,7 +13,7 @@ import pytest
 from uwbslam_jax.measurements import RangeMessage, ScanMessage
 from uwbslam_jax.reasons import OdometryLost, RangeLost, ScanLost, Sensor, StartUpLacks
 from uwbslam_jax.session.frame_assembler import FrameAssembler
-from uwbslam_jax.session.losses import blank_scans, losses, unmatched, unplaced
+from uwbslam_jax.session.losses import blank_scans, ended, losses, unmatched, unplaced
 from uwbslam_jax.session.result_builder import Facts, to_result
 from uwbslam_jax.session.session import Session
 from uwbslam_jax.settings import LidarSettings, MapSettings, Settings
@@ -140,3 +140,8 @@ def test_a_range_message_that_is_counted_is_either_used_or_lost() -> None:
         list(frames.add(RangeMessage(second + k // 4, 0, 1 + k % 4, 2.0)))
     frames.flush()
     assert frames.used[Sensor.RANGE] + sum(frames.dropped.values()) == 40
+
+
+@pytest.mark.parametrize(("after", "duration", "tells"), [(20.0, 40.0, True), (35.0, 40.0, False), (2.0, 6.0, False)])
+def test_scans_that_end_long_before_the_run_are_told(after: float, duration: float, tells: bool) -> None:
+    assert [line.split(" s of")[0] for line in ended(after, duration)] == [f"no scan came after {after:.1f}"] * tells

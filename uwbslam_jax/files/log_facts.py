@@ -15,6 +15,8 @@ _PAUSE_S = 10.0
 """Nothing measured for so long is a pause worth a word [s]."""
 _AWAY = 0.2
 """A node that is heard neither in the first nor in the last such share of a recording comes or goes [ratio]."""
+_THINGS: dict[type, str] = {ScanMessage: "scans", RangeMessage: "ranges", OdometryMessage: "odometry poses"}
+"""What measurements are called [message type -> words]."""
 _COPIED = 0.2
 """Copies of such a share of a sensor's measurements are worth a word [ratio]."""
 _FEW = 20
@@ -42,6 +44,7 @@ class LogFacts:
     _fewest: int = 0
     _copies: Counter[str] = field(default_factory=Counter)
     _recent: Recent = field(default_factory=Recent)
+    _spans: dict[type, tuple[int, int]] = field(default_factory=dict)
     _heard: dict[int, tuple[int, int]] = field(default_factory=dict)
     _first: int | None = None
     _last: int = 0
@@ -71,6 +74,8 @@ class LogFacts:
                     self._wheels.join(message)
                 case TruthMessage():
                     continue
+            known = self._spans.setdefault(type(message), (message.stamp, message.stamp))
+            self._spans[type(message)] = min(known[0], message.stamp), max(known[1], message.stamp)
             if self._first is None:
                 self._first = self._last = message.stamp
             if message.stamp - self._last > _PAUSE_S * 1e9:
@@ -135,10 +140,17 @@ class LogFacts:
         if self._first is None:
             return []
         long = self._last - self._first
+        lines = []
+        for kind, things in _THINGS.items():
+            first, last = self._spans.get(kind, (self._first, self._last))
+            if first - self._first > _AWAY * long:
+                lines.append(f"{things} begin after {(first - self._first) / 1e9:.1f} s")
+            if self._last - last > _AWAY * long:
+                lines.append(f"{things} end after {(last - self._first) / 1e9:.1f} s")
         often = {node: span for node, span in self._heard.items() if self.ids[node] >= _FEW}
         joins = {node: (a - self._first) / 1e9 for node, (a, _) in often.items() if a - self._first > _AWAY * long}
         ends = {node: (b - self._first) / 1e9 for node, (_, b) in often.items() if self._last - b > _AWAY * long}
-        lines = [f"node {node} is first heard after {after:.1f} s" for node, after in sorted(joins.items())]
+        lines += [f"node {node} is first heard after {after:.1f} s" for node, after in sorted(joins.items())]
         lines += [f"node {node} is last heard after {after:.1f} s" for node, after in sorted(ends.items())]
         return lines[:10]
 

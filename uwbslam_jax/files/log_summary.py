@@ -12,7 +12,7 @@ from uwbslam_jax.files.first_look import look_first
 from uwbslam_jax.files.first_ranges import look_ahead
 from uwbslam_jax.files.log_facts import LogFacts
 from uwbslam_jax.files.log_order import StampOrder, told as told_late
-from uwbslam_jax.files.mcap_log import choose_topics
+from uwbslam_jax.files.mcap_log import choose_topics, left_out
 from uwbslam_jax.files.mounting import Mounting, read_mounting
 from uwbslam_jax.files.range_messages import Options, names_told
 from uwbslam_jax.files.schemas import Decoder, Role
@@ -136,6 +136,7 @@ def inspect_log(
                 problems.append(f"no {role} topic")
         except LogError as error:
             problems.append(str(error))
+    problems += left_out(recording, roles, options)
     look = look_first(recording, decoders, roles, options)
     order = StampOrder(look.late) if look.late is not None else None
     problems += [told_late(look.late)] if look.late is not None else []

@@ -9,6 +9,7 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from fnmatch import fnmatchcase
 from functools import cached_property
 from itertools import islice
@@ -102,6 +103,7 @@ class Recording:
         self.topics: dict[str, Role] = {channels[number].topic: role for number, role in self._roles.items()}
         self._warnings = [told_late(self._look.late)] if self._look.late is not None else []
         self._of_clocks: list[str] = []
+        self._warnings += left_out(self._recording, self._roles, self._options)
         if uwb_topic is not None and "uwb" not in self._roles.values():
             self._warnings.append(f"no UWB topic: {'LiDAR' if 'scan' in self._roles.values() else 'odometry'} only")
         ranges = {number: decode for number, decode in self._decoders.items() if self._roles[number] == "uwb"}
@@ -225,6 +227,37 @@ def _discover(recording: Bag, role: Role, options: Options) -> dict[int, Decoder
         fitting = _of_one_radio(joined, unread, options)
         options.told += unread if role == "uwb" and not fitting else []
     return fitting
+
+
+def left_out(recording: Bag, roles: dict[int, Role], options: Options) -> list[str]:
+    """One line for each sensor of which other topics hold as much as those that are used, and how to choose them."""
+    told = []
+    for role, things in (("scan", "scans"), ("uwb", "ranges")):
+        used = sorted({recording.channels[number].topic for number in roles if roles[number] == role})
+        others = {
+            channel.topic
+            for channel in recording.channels.values()
+            if recording.counts[channel.id] and channel.id not in roles and _holds(channel, role, options)
+        }
+        if used and others:
+            several = ", with * for several" if role == "uwb" else "; several scanners are not used together"
+            names, one = ", ".join(sorted(others)), "s" * (len(others) == 1)
+            told.append(
+                f"{names} hold{one} {things} too and {'is' if one else 'are'} left out, {', '.join(used[:3])} is used: "
+                f"--{_KEYS[role]} TOPIC chooses another{several}"
+            )
+    return told
+
+
+def _holds(channel: Channel, role: Role, options: Options) -> bool:
+    """Whether a channel's type and content are those of a role."""
+    if plausible(channel, role, options) is None or channel.topic.startswith("/ground_truth"):
+        return False
+    try:
+        make_decoder(channel, role, replace(options, told=[], names={}, dropped=Counter()))
+        return role != "uwb" or not names_no_node(channel, options) or of_a_radio(channel)
+    except LogError:
+        return False
 
 
 def _of_one_radio(joined: list[Channel], unread: list[str], options: Options) -> dict[int, Decoder]:

@@ -10,6 +10,8 @@ MANY = 0.2
 """Losing a larger share of a sensor is told [0 to 1]: a tenth is a slow computer, a fifth is a fault."""
 FEW = 5
 """Fewer than so many that are lost are not told, unless all are [measurements]: a device may start within a line."""
+_ENDED_S = 5.0
+"""Scans that end by so much before the run are no failure [s]: programs are stopped one after the other."""
 _MOST_REASONS = 2
 """So many reasons are named, the most frequent first [reasons]: a line is not a table."""
 _PLURAL = {Sensor.SCAN: "scans", Sensor.RANGE: "ranges", Sensor.ODOMETRY: "odometry poses"}
@@ -53,6 +55,13 @@ def unmatched(scans: int, poor: int, apart: float) -> list[str]:
         return []
     where = f"{poor} of {scans} scans did not fit the map, and the heading is not known there"
     return [f"{where}: odometry helps, and scans that are less than {apart:.2g} s apart"]
+
+
+def ended(after: float, duration: float) -> list[str]:
+    """A line where the scans of a run end long before it does. after: the time of the last; duration: of the run [s]."""
+    if duration - after <= max(MANY * duration, _ENDED_S):
+        return []
+    return [f"no scan came after {after:.1f} s of {duration:.1f} s: did the LiDAR, its cable or its driver fail?"]
 
 
 def unplaced(lack: Lack, *, ranges: int, seen: bool) -> str:

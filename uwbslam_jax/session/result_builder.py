@@ -15,7 +15,7 @@ from uwbslam_jax.numerics import turned
 from uwbslam_jax.reasons import Reason, Sensor
 from uwbslam_jax.result import BeaconEstimate, BeaconStatus, Result, RunStatus
 from uwbslam_jax.session.history import History
-from uwbslam_jax.session.losses import blank_scans, losses, unmatched, unplaced
+from uwbslam_jax.session.losses import blank_scans, ended, losses, unmatched, unplaced
 from uwbslam_jax.session.session import Session
 from uwbslam_jax.session.update import scan_points
 from uwbslam_jax.startup import Relative
@@ -83,6 +83,7 @@ def to_result(session: Session, facts: Facts) -> Result:
     beacons = _beacons(session, session.ids) if facts.relative is None else _relative_beacons(session, facts.relative)
     told = [*losses(facts.used, facts.dropped).values(), *blank_scans(facts.used[Sensor.SCAN], facts.blank)]
     told += _unmatched(history)
+    told += _ended(history)
     told += [] if scans else [_NO_SCAN if facts.odometry_used else _NO_TRACK]
     told += [] if facts.relative is None else [_RELATIVE]
     told += [] if beacons else _unplaced(session, facts)
@@ -121,6 +122,14 @@ def _unmatched(history: History) -> list[str]:
         return []
     apart = float(np.median(np.diff(history.stamps.values[scans]))) / 1e9
     return unmatched(int(scans.sum()), int(history.diagnostics["poor_match"][scans].sum()), apart)
+
+
+def _ended(history: History) -> list[str]:
+    """Whether the scans end long before the run."""
+    stamps, scans = history.stamps.values, history.has_scan.values
+    if not scans.any():
+        return []
+    return ended(*((int(last) - int(stamps[0])) / 1e9 for last in (stamps[scans][-1], stamps[-1])))
 
 
 def _residuals(history: History, ids: dict[int, int], start: int) -> np.ndarray:
