@@ -45,6 +45,8 @@ class LogFacts:
     _copies: Counter[str] = field(default_factory=Counter)
     _recent: Recent = field(default_factory=Recent)
     _spans: dict[type, tuple[int, int]] = field(default_factory=dict)
+    _ranges: dict[tuple[int, int], float] = field(default_factory=dict)
+    _still: bool = True
     _heard: dict[int, tuple[int, int]] = field(default_factory=dict)
     _first: int | None = None
     _last: int = 0
@@ -105,12 +107,15 @@ class LogFacts:
             for kind, count in self._copies.items()
             if count > _COPIED * (count + heard[kind])
         ]
+        if self._still and self.pairs.total() >= _FEW * max(len(self.pairs), 1):
+            lines.append("no range ever changes: the radio repeats one")
         lines += self._of_nodes() + self._of_scans() + self._wheels.told()
         return lines
 
     def _take_range(self, message: RangeMessage) -> None:
         pair = min(message.source, message.target), max(message.source, message.target)
         self.pairs[pair] += 1
+        self._still = self._still and self._ranges.setdefault(pair, message.range) == message.range
         self.ids.update(pair)
         self.powers = self.powers or not math.isnan(message.receive_power - message.first_path_power)
         for node in pair:

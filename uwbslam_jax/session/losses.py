@@ -58,7 +58,7 @@ def unmatched(scans: int, poor: int, apart: float) -> list[str]:
 
 
 def ended(after: float, duration: float) -> list[str]:
-    """A line where the scans of a run end long before it does. after: the time of the last; duration: of the run [s]."""
+    """A line where the scans of a run end long before it. after: the time of the last; duration: of the run [s]."""
     if duration - after <= max(MANY * duration, _ENDED_S):
         return []
     return [f"no scan came after {after:.1f} s of {duration:.1f} s: did the LiDAR, its cable or its driver fail?"]
