@@ -300,6 +300,11 @@ CASES: dict[str, Case] = {
         fewer_scans,
         noted="note: scans end after 2.4 s",
     ),
+    "uwb_before_1970": Case(
+        each(UWB, lambda row: setattr(row, "stamp", -row.stamp)),
+        near,
+        ("150 of 150 messages of /uwb/",),
+    ),
     "half_turns": Case(in_halves, near, noted="note: scans of 177 deg are parts of a sweep, and put together"),
     "copies_later": Case(
         copied(S // 5),

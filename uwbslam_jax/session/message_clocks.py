@@ -281,6 +281,7 @@ class MessageClocks:
         own = held.own
         off = own.usual if own.known else self._common()
         own.bare += 1
+        own.nobodys += held.stamp < 0 or held.stamp >= _ABSURD
         # a message that says no time has been on its way, as those that do: no difference is worth less than that
         stamp = (held.log or 0) + (off if own.known or abs(off) > _SAME else 0)
         return held.message if held.message.stamp == stamp else replace(held.message, stamp=stamp)

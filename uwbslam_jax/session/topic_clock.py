@@ -21,6 +21,7 @@ class TopicClock:
       stamp, log: of its last good message [ns]. shift: what its stamps are moved by [ns].
       usual: difference of moved stamps to the log time [ns]. known: whether a message was good.
       good, bad, bare, twice: messages, those dropped, those without a stamp, those with the stamp of the one before.
+      nobodys: of those without a stamp those with one that is no time, before 1970 or from 2038 on.
       rate: how many times as fast as the log its stamps pass if they tell no time, 0 if they are whole seconds; else 1.
       drift: of its clock against that of the others.
       begin: its first stamps. until: those up to it come again; again: so many messages do.
@@ -36,6 +37,7 @@ class TopicClock:
     good: int = 0
     bad: int = 0
     bare: int = 0
+    nobodys: int = 0
     twice: int = 0
     rate: float = 1.0
     drift: ClockDrift = field(default_factory=ClockDrift)
@@ -77,7 +79,12 @@ class TopicClock:
                 f"the clock of {self.name} runs {how} against the others': its stamps are put on theirs; let its "
                 "driver stamp with the computer's clock"
             )
-        if self.bare and self.known:
+        if self.nobodys > _MANY * heard:
+            told[self.name, "nobodys"] = (
+                f"{self.nobodys} of {heard} messages of {self.name} have stamps before 1970 or after 2038: their log "
+                "time is taken; see how its driver fills in the time"
+            )
+        elif self.bare and self.known:
             told[self.name, "bare"] = (
                 f"{self.bare} of {heard} messages of {self.name} have no stamp, or one again and again: their log time "
                 "is taken; does its driver wait for a clock (use_sim_time)?"
