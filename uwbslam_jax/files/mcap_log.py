@@ -232,7 +232,8 @@ def _discover(recording: Bag, role: Role, options: Options) -> dict[int, Decoder
 def left_out(recording: Bag, roles: dict[int, Role], options: Options) -> list[str]:
     """One line for each sensor of which other topics hold as much as those that are used, and how to choose them."""
     told = []
-    for role, things in (("scan", "scans"), ("uwb", "ranges")):
+    sensors: dict[Role, str] = {"scan": "scans", "uwb": "ranges"}
+    for role, things in sensors.items():
         used = sorted({recording.channels[number].topic for number in roles if roles[number] == role})
         others = {
             channel.topic
