@@ -29,6 +29,7 @@ _TITLES = {
     "workshop": "Workshop, three laps (Table I, figure of the four cases)",
     "dynamic": "Beacons that drop, join and move (figure of N_t)",
     "speed": "Speed: one lap (figure of HectorSLAM at two speeds)",
+    "clock": "The clock: workshop, three laps, at fewer steps a second",
     "corridor": "Corridor of 22.7 m, walls seen 6 m far",
 }
 _ABOUT = """{seeds} seeds, each a workshop of 12 x 19 m or a corridor of its own; mean and, after the sign, standard

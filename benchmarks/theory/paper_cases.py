@@ -56,6 +56,14 @@ CORRIDOR = {
 }
 """Noise of the LiDAR [m], scans a second, settings."""
 
+CLOCK = {
+    f"{rate:g} steps a second, {about}": (rate, chosen)
+    for rate in (10.0, 5.0, 3.3)
+    for about, chosen in (("no correction", replace(_PAPER, correction=False)), ("correction", _PAPER))
+}
+"""Scans and rounds of ranges a second, settings: 15 pairs of 3 ms each, and 135 steps where the paper counts its run in
+steps, point to some 4 to 5 a second."""
+
 
 @dataclass(frozen=True)
 class Seen:
@@ -134,6 +142,14 @@ def _speed(seed: int) -> Iterator[_Run]:
         yield setting, made, outcome, _of(outcome, "robot", "heading", "stray")
 
 
+def _clock(seed: int) -> Iterator[_Run]:
+    base = simulate("workshop", seed).scenario
+    for setting, (rate, chosen) in CLOCK.items():
+        made = _noisy(replace(base, uwb=replace(base.uwb, rate=rate)), rate)
+        outcome = measure(made, Settings(filter=chosen))
+        yield setting, made, outcome, _of(outcome, "robot", "heading", "stray")
+
+
 def _corridor(seed: int) -> Iterator[_Run]:
     base = simulate("corridor", seed).scenario
     first, second, *_ = intervals.stops(base)
@@ -147,7 +163,7 @@ def _corridor(seed: int) -> Iterator[_Run]:
         yield setting, made, outcome, {"length [m]": LENGTH - true + told} | _of(outcome, "robot", "stray")
 
 
-EXPERIMENTS = {"workshop": _workshop, "dynamic": _dynamic, "speed": _speed, "corridor": _corridor}
+EXPERIMENTS = {"workshop": _workshop, "dynamic": _dynamic, "speed": _speed, "clock": _clock, "corridor": _corridor}
 """Each yields setting, scenario, outcome and figures for a seed."""
 
 

@@ -39,6 +39,8 @@ _FEWEST_MEANS = 6
 """A resting place that was ranged less takes no part: fewer averages leave more than one place for it."""
 _RADIO = 0.8
 """Where so many of the means to each place are loud, it is the radio that is, and no wall in between [share]."""
+_FASTEST = 5.0
+"""No robot with a LiDAR to map by drives faster indoors [m/s]."""
 _MOVES, _ENOUGH = 25, 0.05
 """Moves of a stage at most [moves]: a bound for starts far off; one that gains less log-likelihood than this is the
 last."""
@@ -152,11 +154,15 @@ class _Solved:
         of the same look hold them there, and no small move leads away. Each is tried between its neighbours."""
         poses, places, off = self.problem.split(self.x)
         astray = self.problem.contradicted(self.x)
-        if not astray.any() or astray.all():
+        if not astray.any() or np.sum(~astray) < 2:
             return self
-        good, every = np.flatnonzero(~astray), np.arange(len(poses))
+        good, t = np.flatnonzero(~astray), self.problem.time
         way = np.column_stack([poses[good, :2], np.unwrap(poses[good, 2])])
-        there = np.column_stack([np.interp(every, good, column) for column in way.T])
+        there = np.column_stack([np.interp(t, t[good], column) for column in way.T])
+        # scans that come faster than a robot drives were not taken at their stamps, and ranges tell nothing
+        speed = np.hypot(*np.diff(way[:, :2], axis=0).T) / np.maximum(np.diff(t[good]), 1e-3)
+        before = np.clip(np.searchsorted(good, np.flatnonzero(astray)) - 1, 0, len(good) - 2)
+        astray[astray] = speed[before] < _FASTEST
 
         def moved(which: np.ndarray) -> tuple[Problem, np.ndarray]:
             problem = self.problem.evened(which)
@@ -183,11 +189,12 @@ class _Solved:
 @dataclass(frozen=True)
 class Problem(PoseGraph):
     """The run in arrays: nodes are its places, slots those that have a bias each, the robot's first; antenna: (2,) on
-    the robot [m]."""
+    the robot [m]. time: (count,) of the poses [s]."""
 
     nodes: list[Node]
     slots: list[int]
     antenna: np.ndarray
+    time: np.ndarray
 
     @staticmethod
     def build(graph: Graph, poses: np.ndarray, places: dict[Node, np.ndarray], host: HostParams) -> Problem | None:
@@ -227,6 +234,7 @@ class Problem(PoseGraph):
             nodes=nodes,
             slots=slots,
             antenna=host.antenna,
+            time=(graph.stamps() - graph.stamps()[0]) / 1e9,
         )
 
     def evened(self, astray: np.ndarray) -> Problem:
