@@ -13,6 +13,11 @@ _ARENA_MAX, _ARENAS = -8, 2
 beside it [heaps]."""
 
 
+def cache_folder() -> Path:
+    """The user's folder for what is compiled once."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "uwbslam_jax"
+
+
 def prepare() -> None:
     """Settings that the libraries read once. The package calls it when it is imported; what the user has set stays.
 
@@ -20,10 +25,9 @@ def prepare() -> None:
     LAPACK's threads spin over matrices of 40 rows and make a step many times slower than one thread does, and sums over
     threads round differently. Memory is allocated from a few heaps. Warns where JAX is at work already.
     """
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "uwbslam_jax" / "jax"
     chosen = "OPENBLAS_NUM_THREADS" in os.environ
     wanted = {
-        "JAX_COMPILATION_CACHE_DIR": str(cache),
+        "JAX_COMPILATION_CACHE_DIR": str(cache_folder() / "jax"),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.2",
         "OPENBLAS_NUM_THREADS": "1",
         # the same holds for XLA's kernels of a step, each of which takes microseconds

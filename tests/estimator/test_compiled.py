@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from uwbslam_jax.estimator.compiled import Packing
+from uwbslam_jax.estimator.packing import Packing
 from uwbslam_jax.measurements import Frame, empty_frame
 
 
