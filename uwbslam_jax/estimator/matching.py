@@ -31,6 +31,8 @@ _CHECKED_BEAMS = 360
 """So many beams score the expected pose as well as all of them do."""
 _BLIND = (0.006, 0.02)
 """Share of normals in the least seen direction below which a scan is blind in it, and above which it is not."""
+_FEW_SURFACES = 20
+"""So few beams with a surface do not tell in which direction a scan is blind."""
 
 
 class Match(NamedTuple):
@@ -84,7 +86,7 @@ def blind_direction(surface: Surface, counted: Bool[Array, "B"]) -> Blind:
     direction = jnp.stack([jnp.cos(angle), jnp.sin(angle)])
     least = jnp.maximum(0.5 * (a + c - jnp.sqrt((a - c) ** 2 + 4 * b**2)), 0.0)
     weight = jnp.clip((_BLIND[1] - least) / (_BLIND[1] - _BLIND[0]), 0.0, 1.0)
-    return Blind(direction, jnp.where(count > 20, weight, 0.0))
+    return Blind(direction, jnp.where(count > _FEW_SURFACES, weight, 0.0))
 
 
 def seen(blind: Blind, heading: Float[Array, ""]) -> Float[Array, "2 2"]:

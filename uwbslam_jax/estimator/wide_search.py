@@ -20,6 +20,11 @@ _TURN = 0.4
 """A turn that counts as a distance of one [rad]: in real corridors turns of up to 80 degrees between two scans are
 found with it, and scans that would fit turned by half are not: on new ground, of which the map knows little, looking
 back at known walls has to cost more than it gains."""
+_PATCH_SIDE, _PATCH_SPREAD, _PATCH_M = 5, 1.5, (0.05, 0.6)
+"""A patch of positions: so many along a side, over so many standard deviations of what is expected to either side, at
+least and at most so far [m]."""
+_REFINE_SPREAD = 0.3
+"""Standard deviation of what holds a start where it is aligned [m, rad]."""
 
 
 def search(
@@ -47,8 +52,9 @@ def search(
     size = resolution * 2**k
     stride = max(1, sweep.points.shape[0] // _SEARCH_BEAMS)
     points, valid = sweep.points[::stride], sweep.valid[::stride]
-    spread = jnp.clip(1.5 * jnp.sqrt(jnp.maximum(expected.cov[0, 0], expected.cov[1, 1])), 0.05, 0.6)
-    axis = jnp.linspace(-1.0, 1.0, 5)
+    spread = _PATCH_SPREAD * jnp.sqrt(jnp.maximum(expected.cov[0, 0], expected.cov[1, 1]))
+    spread = jnp.clip(spread, *_PATCH_M)
+    axis = jnp.linspace(-1.0, 1.0, _PATCH_SIDE)
     patch = jnp.stack(jnp.meshgrid(axis, axis), axis=-1).reshape(-1, 2) * spread
     centres = jnp.stack([expected.mean[:2], last[:2]])
     places = (centres[:, None] + patch[None]).reshape(-1, 2)
@@ -82,7 +88,7 @@ def search(
     starts = jnp.concatenate([found[None], starts])
 
     def refine(start: Float[Array, "3"]) -> tuple[Float[Array, "3"], Float[Array, ""]]:
-        wide = Gaussian(start, jnp.diag(jnp.array([0.3, 0.3, 0.3]) ** 2))
+        wide = Gaussian(start, jnp.diag(jnp.full(3, _REFINE_SPREAD) ** 2))
         pose = align(grid, view, start, wide, resolution)
         score, known = fit(grid, sweep, pose, resolution, k)
         return pose, (score - 0.5) * known - unlikely(pose[:2], pose[2])

@@ -1,6 +1,6 @@
 """A sweep, the cells, the tiles: the map."""
 
-from uwbslam_jax.mapping import grid as grid
+from uwbslam_jax.mapping import grid as grid, sweep as sweep
 from uwbslam_jax.mapping.grid import EPOCH_LEVEL as EPOCH_LEVEL, Grid as Grid
 from uwbslam_jax.mapping.sweep import (
     Surface as Surface,

@@ -17,6 +17,10 @@ _GAPS = (1, 2, 4, 8, 16)
 """A gap is closed from either side in such strides: up to 31 beams of it [beams]."""
 _NORMAL_SPAN = (0.25, 1.0)
 """A normal needs neighbours this far apart [m]."""
+_OFF_LINE = (0.025, 0.05)
+"""How far a beam's end may be off the line through its neighbours: so much [m], and so much of their distance."""
+_LOPSIDED = 0.4
+"""Where a neighbour is a stand-in, the beam may be so far off their middle, as a share of their distance."""
 
 
 class Surface(NamedTuple):
@@ -58,11 +62,11 @@ def find_surface(sweep: Sweep) -> Surface:
         off = jnp.abs(dx * y - dy * x) * scale
         ok = valid & shifted(before_valid, -k) & shifted(after_valid, k) & ~found
         ok = ok & (span > _NORMAL_SPAN[0]) & (span < _NORMAL_SPAN[1])
-        tolerance = 0.025 + 0.05 * span
+        tolerance = _OFF_LINE[0] + _OFF_LINE[1] * span
         # where neither is a stand-in, they are also as far to either side: no wall seen at a grazing angle, whose
         # direction a step in it would turn
         own_two = shifted(wide_valid, -k) & shifted(wide_valid, k)
-        uneven = jnp.where(own_two, jnp.sqrt(jnp.maximum(tolerance**2 - off**2, 0.0)), 0.4 * span)
+        uneven = jnp.where(own_two, jnp.sqrt(jnp.maximum(tolerance**2 - off**2, 0.0)), _LOPSIDED * span)
         even = jnp.abs(share - 0.5) * span < uneven
         ok = ok & even & (off < tolerance)
         tangent = jnp.where(ok[None], jnp.stack([dx * scale, dy * scale]), tangent)
