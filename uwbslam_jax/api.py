@@ -17,7 +17,7 @@ from typing import Any, Literal, TypeGuard, cast
 
 from uwbslam_jax import evaluation, result as data
 from uwbslam_jax.errors import LogError, UsageError
-from uwbslam_jax.estimator import CompileClock
+from uwbslam_jax.estimator import CompileClock, chosen
 from uwbslam_jax.evaluation import Truth
 from uwbslam_jax.files import LogSummary, Recording, inspect_log, mounting, read_run, settings_file, write_result
 from uwbslam_jax.measurements import Message, ScanMessage, TruthMessage
@@ -150,7 +150,7 @@ def run(
     reader = messages if isinstance(messages, Recording) else None
     if reader is not None and "uwb" not in reader.topics.values():
         settings = dataclasses.replace(settings, filter=dataclasses.replace(settings.filter, lidar_only=True))
-    settings = fit_beams(settings, messages)
+    settings = chosen(fit_beams(settings, messages), compile_beside=True)
     saved, fixed = _saved(resume, localize, settings)
     total = reader.message_count if reader is not None else 0
     with CompileClock() as clock:
@@ -209,7 +209,7 @@ class Slam:
         Raises:
           ConfigError, RunError, UsageError: see `run`.
         """
-        self.settings = settings_file.check(settings or Settings())
+        self.settings = chosen(settings_file.check(settings or Settings()), compile_beside=True)
         self.on_update = on_update
         self._goes_on = _saved(resume, localize, self.settings)
         self._held: list[Message] = []

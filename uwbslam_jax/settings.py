@@ -265,6 +265,9 @@ class FilterSettings:
 
     preset: Literal["robust", "paper"] = "robust"
     """robust: everything. paper: the paper as printed with its errata corrected."""
+    engine: Literal["auto", "jax", "native"] = "auto"
+    """What steps: jax; native, its twin without XLA, several times as fast, preset robust only; auto: native where it
+    is compiled, else jax, and native is compiled beside the run for the next."""
     scan_matching: bool = True
     """Paper's case: without it the map is drawn at the UWB pose."""
     correction: bool = True

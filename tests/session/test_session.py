@@ -101,8 +101,11 @@ def test_a_beacon_that_is_only_doubted_keeps_its_place_in_the_graph():
     assert set(means["place"][means["slot"] == slot].tolist()) == {place[1]}
 
 
-def test_online_and_batch_give_the_same_bits():
-    online, batch = Session(SETTINGS), Session(SETTINGS)
+@pytest.mark.parametrize("engine", ["jax", "native"])
+def test_online_and_batch_give_the_same_bits(engine):
+    settings = replace(SETTINGS, filter=replace(SETTINGS.filter, engine=engine))
+    online, batch = Session(settings), Session(settings)
+    assert online.engine == engine
     frames = Drive(online).frames(4 * CONTROL_EVERY, (10, 20, 30))
     one_by_one = [online.step(frame) for frame in frames]
     chunked = [e for k in range(4) for e in batch.steps(frames[CONTROL_EVERY * k : CONTROL_EVERY * (k + 1)])]

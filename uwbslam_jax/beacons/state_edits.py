@@ -45,8 +45,7 @@ def place(state: State, slot: int, spot: Spot, rows: np.ndarray, *, moving: bool
     P[own, :], P[:, own] = cross, cross.T
     P[np.ix_(own, own)] = cov
     belief = Gaussian(jnp.asarray(mean, jnp.float32), jnp.asarray(P, jnp.float32))
-    active, walks = state.active.at[slot].set(True), state.moving.at[slot].set(moving)
-    return state._replace(belief=belief, active=active, moving=walks)
+    return _flagged(state._replace(belief=belief), slot, active=True, moving=moving)
 
 
 def _follows(spot: Spot, rows: np.ndarray, robot: np.ndarray, k: int) -> np.ndarray:
@@ -65,30 +64,38 @@ def _follows(spot: Spot, rows: np.ndarray, robot: np.ndarray, k: int) -> np.ndar
 
 def remove(state: State, slot: int) -> State:
     """The state without a beacon; its rows of the covariance become those of an empty slot."""
-    k = state.active.shape[0]
-    own = jnp.asarray(_rows_of(slot, k))
-    mean = state.belief.mean.at[own].set(0.0)
-    variance = jnp.array([1.0, 1.0, _RESTING_SPEED**2, _RESTING_SPEED**2])
-    P = state.belief.cov.at[own, :].set(0.0).at[:, own].set(0.0).at[own, own].set(variance)
-    active, moving = state.active.at[slot].set(False), state.moving.at[slot].set(False)
-    return state._replace(belief=Gaussian(mean, P), active=active, moving=moving)
+    own = _rows_of(slot, state.active.shape[0])
+    mean, P = np.array(state.belief.mean), np.array(state.belief.cov)
+    mean[own] = P[own, :] = P[:, own] = 0.0
+    P[own, own] = [1.0, 1.0, _RESTING_SPEED**2, _RESTING_SPEED**2]
+    belief = Gaussian(jnp.asarray(mean), jnp.asarray(P))
+    return _flagged(state._replace(belief=belief), slot, active=False, moving=False)
 
 
 def loosen(state: State, slot: int, variance: float) -> State:
     """The state with a beacon's place less certain by a variance in each direction [m^2]."""
-    at = jnp.array([2 * slot, 2 * slot + 1])
-    return state._replace(belief=state.belief._replace(cov=state.belief.cov.at[at, at].add(variance)))
+    at, P = np.array([2 * slot, 2 * slot + 1]), np.array(state.belief.cov)
+    P[at, at] += np.float32(variance)
+    return state._replace(belief=state.belief._replace(cov=jnp.asarray(P)))
 
 
 def put_robot(state: State, position: np.ndarray) -> State:
     """The state with the robot somewhere else: at rest, heading unknown, the map where it was."""
     k = state.active.shape[0]
-    rows = jnp.array([0, 1, 2 * k, 2 * k + 1, 4 * k, 4 * k + 1, *state_vector.map_error_indices(k)])
-    variance = jnp.array([0.3**2, 0.3**2, 1.0, 1.0, 10.0, 1.0, 0.05**2, 0.05**2, 0.01**2])
-    mean = state.belief.mean.at[rows].set(0.0).at[:2].set(jnp.asarray(position, jnp.float32))
-    mean = mean.at[4 * k].set(state.belief.mean[4 * k])
-    P = state.belief.cov.at[rows, :].set(0.0).at[:, rows].set(0.0).at[rows, rows].set(variance)
-    return state._replace(belief=Gaussian(mean, P))
+    rows = np.array([0, 1, 2 * k, 2 * k + 1, 4 * k, 4 * k + 1, *state_vector.map_error_indices(k)])
+    mean, P = np.array(state.belief.mean), np.array(state.belief.cov)
+    heading = mean[4 * k]
+    mean[rows] = P[rows, :] = P[:, rows] = 0.0
+    mean[:2], mean[4 * k] = position, heading
+    P[rows, rows] = [0.3**2, 0.3**2, 1.0, 1.0, 10.0, 1.0, 0.05**2, 0.05**2, 0.01**2]
+    return state._replace(belief=Gaussian(jnp.asarray(mean), jnp.asarray(P)))
+
+
+def _flagged(state: State, slot: int, *, active: bool, moving: bool) -> State:
+    """The state with a slot in use or not, carried or at rest."""
+    used, carried = np.array(state.active), np.array(state.moving)
+    used[slot], carried[slot] = active, moving
+    return state._replace(active=jnp.asarray(used), moving=jnp.asarray(carried))
 
 
 def _rows_of(slot: int, k: int) -> np.ndarray:

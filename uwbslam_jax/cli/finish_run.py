@@ -60,7 +60,10 @@ def effort(result: Result) -> Iterator[tuple[str, str]]:
     counts = [f"{states.count(status)} {status}" for status in dict.fromkeys(states)]
     yield "beacons placed", f"{len(states)} of {len(summary['ids'])} ({', '.join(counts)})" if states else "none"
     yield "recording", f"{summary['duration_s']:.1f} s, {summary['steps']} steps"
-    yield "step, median and 95 %", f"{summary['step_ms_median']:.2f} ms, {summary['step_ms_p95']:.2f} ms"
+    yield (
+        f"step ({summary['engine']}), median and 95 %",
+        f"{summary['step_ms_median']:.2f} ms, {summary['step_ms_p95']:.2f} ms",
+    )
     yield "real-time factor", f"{summary['real_time_factor']:.1f} (compilation, {summary['compile_s']:.1f} s, left out)"
 
 

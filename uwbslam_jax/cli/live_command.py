@@ -90,7 +90,7 @@ def live(options: LiveOptions) -> None:
         if devices is None:
             devices = Devices(*ends.enter_context(_emulators(str(options.emulate), options.out)))
         print("getting ready", flush=True)
-        rehearse(settings)
+        rehearse(slam.settings)
         if not go():
             raise KeyboardInterrupt
         recording = options.out / f"live-{datetime.now(UTC):%Y%m%d-%H%M%S}.mcap"

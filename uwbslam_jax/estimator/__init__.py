@@ -2,6 +2,7 @@
 
 from uwbslam_jax.estimator import compiled as compiled, ranging as ranging, state_vector as state_vector
 from uwbslam_jax.estimator.compiled import CompileClock as CompileClock
+from uwbslam_jax.estimator.engines import Engine as Engine, begun as begun, chosen as chosen
 from uwbslam_jax.estimator.host_view import (
     Changes as Changes,
     HostView as HostView,

@@ -13,6 +13,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from uwbslam_jax.measurements import Leaf
+
 
 class Nodes(NamedTuple):
     """The state vector taken apart; see the module's first lines for shapes and units."""
@@ -34,7 +36,7 @@ def state_size(nodes: int) -> int:
     return 4 * nodes + 5
 
 
-def unpack(vector: Float[Array, "n"]) -> Nodes:
+def unpack(vector: Float[Leaf, "n"]) -> Nodes:
     """Names for the entries of a state vector."""
     k = node_count(vector.shape[0])
     return Nodes(
@@ -62,7 +64,7 @@ def map_error_indices(nodes: int) -> tuple[int, int, int]:
     return 4 * nodes + 2, 4 * nodes + 3, 4 * nodes + 4
 
 
-def robot_pose(vector: Float[Array, "n"]) -> Float[Array, "3"]:
+def robot_pose(vector: Float[Leaf, "n"]) -> Float[Leaf, "3"]:
     """The robot's x, y, heading [m, m, rad]."""
     return vector[jnp.array(pose_indices(node_count(vector.shape[0])))]
 

@@ -130,6 +130,8 @@ def check(settings: Settings) -> Settings:
             raise ConfigError(f"{name} = {value!r}: must be a topic name without blanks")
     if settings.filter.preset not in ("robust", "paper"):
         raise ConfigError(f"filter.preset = {settings.filter.preset!r}: must be 'robust' or 'paper'")
+    if settings.filter.engine not in ("auto", "jax", "native"):
+        raise ConfigError(f"filter.engine = {settings.filter.engine!r}: must be 'auto', 'jax' or 'native'")
     _check_together(settings)
     return settings
 
@@ -167,6 +169,8 @@ def _check_together(settings: Settings) -> None:
         raise ConfigError(
             f"map.size_m = {window.size_m}: makes {cells:.0f} cells a side, must be from {8 * coarsest} to {_MAX_CELLS}"
         )
+    if switches.engine == "native" and switches.preset != "robust":
+        raise ConfigError(f"filter.engine = 'native': serves filter.preset = 'robust' only, not {switches.preset!r}")
     if switches.lidar_only and not switches.scan_matching:
         raise ConfigError("filter.lidar_only = true: needs filter.scan_matching = true, nothing else would be left")
 

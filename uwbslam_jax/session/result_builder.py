@@ -291,6 +291,7 @@ def _summary(session: Session, facts: Facts) -> dict[str, Any]:
     return {
         "steps": len(stamps),
         "duration_s": duration,
+        "engine": session.engine,
         "wall_s": facts.wall_s,
         "compile_s": facts.compile_s,
         "step_ms_median": float(np.median(step_ms)) if step_ms else None,

@@ -15,7 +15,7 @@ import numpy as np
 
 from uwbslam_jax.backend import BackEnd, Graph, Hindsight, notable
 from uwbslam_jax.beacons import MEMORY_S, BeaconKeeper
-from uwbslam_jax.estimator import Changes, Estimate, HostView, compiled, init, widened
+from uwbslam_jax.estimator import Changes, Estimate, HostView, State, begun, chosen, compiled, init, widened
 from uwbslam_jax.mapping import Tiles
 from uwbslam_jax.measurements import Odometry, StampedFrame
 from uwbslam_jax.reasons import Lack
@@ -49,7 +49,7 @@ class Session:
     Attributes:
       settings, config, params: what it runs with; params grow biases and heights as ids get slots, and all of them
         slots where there are more beacons than uwb.max_beacons.
-      state, tiles: the estimator's, and what of its map lies outside the window.
+      tiles: what of the estimator's map lies outside its window.
       decided_at: stamp of the frame at which the published frame was decided, None before [ns].
       status: of the start-up. hypotheses: explanations of the start that are alive.
       found: what ranges were found to be off by.
@@ -60,11 +60,11 @@ class Session:
     """
 
     def __init__(self, settings: Settings):
-        self.settings = settings
+        self.settings = settings = chosen(settings)
         # until the beacons are placed there is nothing for the paper's steps to stand on
         self.config = dataclasses.replace(make_config(settings), preset="robust")
         self.params = make_params(settings)
-        self.state = init(self.config)
+        self._engine = begun(settings, init(self.config))
         self.tiles = Tiles(settings.map.resolution)
         self.history = History()
         self.decided_at: int | None = None
@@ -81,6 +81,20 @@ class Session:
         self._start_up = StartUp(self.host)
         self._keeper = BeaconKeeper()
         self.back_end = BackEnd(settings)
+
+    @property
+    def state(self) -> State:
+        """The estimator's now. What was read of it is void after the next step."""
+        return self._engine.state
+
+    @state.setter
+    def state(self, state: State) -> None:
+        self._engine.state = state
+
+    @property
+    def engine(self) -> str:
+        """Name of what steps."""
+        return self._engine.name
 
     @property
     def host(self) -> HostParams:
@@ -135,7 +149,7 @@ class Session:
     def step(self, frame: StampedFrame) -> Estimate:
         """One frame in, its estimate out (numpy)."""
         frame = self._admitted(frame)
-        self.state, (estimate,) = compiled.step(self.config, self.params, self.state, [frame.frame])
+        (estimate,) = self._engine.step(self.config, self.params, [frame.frame])
         if self.listener is not None:
             self.listener(self.update(frame, estimate))
         self._take(frame, estimate)
@@ -146,7 +160,7 @@ class Session:
         if len(frames) != CONTROL_EVERY or self._pending or len(frames[-1].slots) > self.config.nodes:
             return [self.step(frame) for frame in frames]
         frames = [self._admitted(frame) for frame in frames]
-        self.state, estimates = compiled.step(self.config, self.params, self.state, [f.frame for f in frames])
+        estimates = self._engine.step(self.config, self.params, [f.frame for f in frames])
         for frame, estimate in zip(frames, estimates, strict=True):
             self._take(frame, estimate)
         return estimates
