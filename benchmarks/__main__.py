@@ -40,10 +40,14 @@ def main() -> int:
     parser.add_argument("--gate", action="store_true", help="exit 1 where a bar or the baseline is missed")
     parser.add_argument("--baseline", action="store_true", help="make this run's ratios the baseline")
     parser.add_argument("--quick", action="store_true", help="less of everything, to try it out: nothing is written")
+    parser.add_argument("--load", type=int, metavar="N", help="step: beside so many busy processes; nothing is written")
     options = parser.parse_args()
+    if options.load and options.name != "step":
+        parser.error("--load is for step only")
     wing = "theory" if options.name in _THEORY else "speed"
-    report = importlib.import_module(f"benchmarks.{wing}.{options.name}").measure(quick=options.quick)
-    if options.quick:
+    beside = {"load": options.load} if options.load else {}
+    report = importlib.import_module(f"benchmarks.{wing}.{options.name}").measure(quick=options.quick, **beside)
+    if options.quick or options.load:
         for m in report.metrics:
             print(f"{m.name}: {m.value:.4g} {m.unit}")
         print(report.skipped)

@@ -1,7 +1,11 @@
-"""One online step over the hall at 40 Hz: the whole of it, its parts, and KISS-ICP on the same scans in turn."""
+"""One online step over the hall at 40 Hz: by each engine, its parts, and KISS-ICP on the same scans in turn."""
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from functools import partial
@@ -14,8 +18,9 @@ import numpy as np
 import uwbslam_jax as us
 from benchmarks.metric import Metric, Report, ratio, spread
 from uwbslam_jax.estimator import matching, motion, ranging, state_vector
+from uwbslam_jax.estimator.native.warm_up import warm_up
 from uwbslam_jax.mapping import grid, undo_motion
-from uwbslam_jax.measurements import StampedFrame
+from uwbslam_jax.measurements import Message, StampedFrame
 from uwbslam_jax.numerics import Gaussian, rotation
 from uwbslam_jax.session import Session
 
@@ -27,46 +32,93 @@ _LOOSE = (0.1, 0.1, 0.05)
 """What the step adds to the prior of a match [m, m, rad]."""
 
 
-def measure(*, quick: bool) -> Report:
-    """Online steps, every 400th apart; KISS-ICP registers the scan of each step right after it."""
-    simulation, peer = us.simulate("hall40", 0, 30.0 if quick else _SECONDS), _kiss_icp()
-    slam = us.Slam(simulation.settings, on_update=lambda _: published.append(time.perf_counter()))
-    whole, to_pose, theirs, drawn = [], [], [], []
-    published: list[float] = []
-    last: us.Update | None = None
-    for message in list(simulation):
+class _Run:
+    """One engine's online run of the recording.
+
+    Attributes:
+      whole, to_pose, drawn: of each step, seconds to its end and to its pose, and whether its scan was drawn.
+      slam: the run. last: its newest update.
+    """
+
+    def __init__(self, engine: str, settings: us.Settings):
+        self.whole: list[float] = []
+        self.to_pose: list[float] = []
+        self.drawn: list[bool] = []
+        self.last: us.Update | None = None
+        self._published = 0.0
+        steps = dataclasses.replace(settings.filter, engine=engine)
+        self.slam = us.Slam(dataclasses.replace(settings, filter=steps), on_update=self._publish)
+
+    def _publish(self, _: us.Update) -> None:
+        self._published = time.perf_counter()
+
+    def take(self, message: Message) -> us.Update | None:
+        """A message in; the update of a step that it led to."""
         begin = time.perf_counter()
-        updates = slam.add(message)
+        updates = self.slam.add(message)
         end = time.perf_counter()
         if len(updates) != 1:  # none, or at the start all that was held
-            continue
-        (last,) = updates
-        whole.append(end - begin)
-        to_pose.append(published[-1] - begin)
-        drawn.append(bool(last.estimate.drawn))
-        if peer is not None and last.frame.frame.has_scan:
-            theirs.append(peer(last.frame))
-    assert last is not None
-    ours, early = np.array(whole[_WARM:]), np.array(to_pose[_WARM:])
-    metrics = spread("step", ours, median=0.5, p95=2.0, p99=5.0)
-    metrics += [
-        Metric("step, least", 1e3 * float(ours.min()), "ms", "lower"),
-        Metric("of it: after the pose is published, median", 1e3 * float(np.median(ours - early)), "ms", "lower"),
-        Metric("of it: to the pose, scan drawn, median", 1e3 * float(np.median(early[drawn[_WARM:]])), "ms", "lower"),
-    ]
-    parts = _parts(slam.runner.session, last.frame)
-    metrics += [Metric(f"by itself: {part}, median", 1e3 * t, "ms", "lower") for part, t in parts]
+            return None
+        (self.last,) = updates
+        self.whole.append(end - begin)
+        self.to_pose.append(self._published - begin)
+        self.drawn.append(bool(self.last.estimate.drawn))
+        return self.last
+
+    def figures(self, name: str, **asked: float) -> list[Metric]:
+        """Times of its steps. asked: see `spread`."""
+        whole, early, drawn = (np.array(values[_WARM:]) for values in (self.whole, self.to_pose, self.drawn))
+        return [
+            *spread(name, whole, **asked),
+            Metric(f"{name}, least", 1e3 * float(whole.min()), "ms", "lower"),
+            Metric(
+                f"{name}, after the pose is published, median", 1e3 * float(np.median(whole - early)), "ms", "lower"
+            ),
+            Metric(f"{name}, to the pose, scan drawn, median", 1e3 * float(np.median(early[drawn])), "ms", "lower"),
+        ]
+
+    def shares(self, name: str, kiss: float, bars: tuple[float, float, float]) -> list[Metric]:
+        """Median, 95 and 99 % of its steps over a median of KISS-ICP [s]."""
+        whole = np.array(self.whole[_WARM:])
+        figures = zip(("median", "p95", "p99"), np.percentile(whole, [50, 95, 99]), bars, strict=True)
+        return [ratio(f"{name} / KISS-ICP's median, {key}", float(t) / kiss, bar=bar) for key, t, bar in figures]
+
+
+def measure(*, quick: bool, load: int = 0) -> Report:
+    """Online steps of both engines on each message, and KISS-ICP on the scan of each step right after. load: so many
+    processes keep the machine busy meanwhile."""
+    simulation, peer = us.simulate("hall40", 0, 30.0 if quick else _SECONDS), _kiss_icp()
+    warm_up()
+    native, reference = _Run("native", simulation.settings), _Run("jax", simulation.settings)
+    theirs = []
+    with contextlib.ExitStack() as ends:
+        for _ in range(load):
+            busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+            ends.callback(busy.wait)
+            ends.callback(busy.kill)
+        for message in list(simulation):
+            last = native.take(message)
+            reference.take(message)
+            if peer is not None and last is not None and last.frame.frame.has_scan:
+                theirs.append(peer(last.frame))
+    metrics = native.figures("step", median=0.5) + reference.figures("step by jax", median=2.0)
+    assert reference.last is not None
+    parts = _parts(reference.slam.runner.session, reference.last.frame)
+    metrics += [Metric(f"jax, by itself: {part}, median", 1e3 * t, "ms", "lower") for part, t in parts]
     if peer is not None:
         kiss = np.array(theirs[_WARM:])
         metrics += spread("KISS-ICP", kiss)[:3]
-        share = float(np.median(ours) / np.median(kiss))
-        metrics.append(ratio("step / KISS-ICP, medians", share, bar=0.8))
+        bars = (1.0, 3.0, 6.0) if load else (0.5, 1.5, 3.0)
+        metrics += native.shares("step", float(np.median(kiss)), bars)
+        metrics += reference.shares("step by jax", float(np.median(kiss)), (2.0, 8.0, 16.0))[:1]
     about = (
-        f"{len(ours)} steps of the hall at 40 Hz, 1081 beams, five beacons that range in all pairs, three levels, map "
-        "updates and the host's own work included, from the message to its update, as on the robot. KISS-ICP (C++, one "
-        "thread, default settings for this range) registers the same scan right after each step, so both meet the same "
-        "machine. The parts are compiled by themselves; together they share work."
+        f"{len(native.whole) - _WARM} steps of the hall at 40 Hz, 1081 beams, five beacons that range in all pairs, "
+        "three levels, map updates and the host's own work included, from the message to its update, as on the robot, "
+        "by the native engine and by the JAX step in turn. KISS-ICP (C++, one thread, default settings for this range) "
+        "registers the same scan right after, so all meet the same machine. The parts are compiled by themselves; "
+        "together they share work."
     )
+    about += f" {load} other processes keep the machine busy." if load else ""
     return Report("One online step", about + ("" if peer else " KISS-ICP is not installed: left out."), metrics)
 
 
