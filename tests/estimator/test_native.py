@@ -65,7 +65,9 @@ def cases() -> dict[str, tuple[State, Frame]]:
     drawn_elsewhere = driving._replace(drawn_pose=jnp.zeros(3))
     loud = driving._replace(scatter=driving.scatter._replace(log=jnp.full((4, 4), 1.2), heard=jnp.ones((4, 4), bool)))
     restless = driving._replace(unrest=jnp.array([0.01, 0.004]))
-    other_epoch = driving._replace(map_spread=driving.map_spread._replace(epoch=jnp.float32(9.0)))
+    apart = jnp.diag(jnp.array([0.004, 0.003, 0.001], jnp.float32))
+    spread = driving.map_spread._replace(epoch=jnp.float32(9.0), apart=apart)
+    other_epoch = driving._replace(map_spread=spread)
     lost = driving._replace(belief=driving.belief._replace(cov=100.0 * driving.belief.cov))
     gaps = np.array([np.nan, 20.0, 3.0, 11.0, 10.0, np.nan])
     return {
@@ -120,6 +122,23 @@ def test_both_engines_make_the_same_of_random_states(config):
         wheels = odometry(*(0.03 * rng.normal(size=3))) if seed % 3 == 0 else NOTHING
         frames = [measured(pose, config, seed=seed, odometry=wheels), measured(pose, config, seed=99 - seed)]
         both.step(config, PARAMS, state, frames)
+    both.found.check()
+
+
+def test_both_engines_make_the_same_of_a_corridor_without_ends():
+    walls = np.array([[[-90.0, -1.2], [90.0, -1.2]], [[-90.0, 1.4], [90.0, 1.4]]]) + 0.05
+    frames = []
+    for n in range(16):
+        scan = room.scan(np.array([0.12 * n, 0.02 * n, 0.02 * n]), BEAMS, walls)
+        near = scan.valid & (scan.ranges < 9.0)
+        frames.append(
+            measured(scan=scan._replace(valid=near, ranges=np.where(near, scan.ranges, 0).astype(np.float32)))
+        )
+    both = BothEngines()
+    _, estimates = both.step(CONFIG, PARAMS, init(CONFIG), frames)
+    information = estimates[-1].information
+    assert information[0, 0] < 0.2 * information[1, 1]  # blind along the corridor
+    assert both.found.drawn > 10
     both.found.check()
 
 

@@ -92,5 +92,5 @@ def chosen(settings: Settings, *, compile_beside: bool = False) -> Settings:
 
 
 def begun(settings: Settings, state: State) -> Engine:
-    """The engine that the settings name, with a state to begin with."""
-    return NativeEngine(state) if chosen(settings).filter.engine == "native" else JaxEngine(state)
+    """The engine that the settings name, with a state to begin with; "auto" here is the JAX one, see `chosen`."""
+    return NativeEngine(state) if settings.filter.engine == "native" else JaxEngine(state)

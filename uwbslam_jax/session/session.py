@@ -15,7 +15,7 @@ import numpy as np
 
 from uwbslam_jax.backend import BackEnd, Graph, Hindsight, notable
 from uwbslam_jax.beacons import MEMORY_S, BeaconKeeper
-from uwbslam_jax.estimator import Changes, Estimate, HostView, State, begun, chosen, compiled, init, widened
+from uwbslam_jax.estimator import Changes, Estimate, HostView, State, begun, compiled, init, widened
 from uwbslam_jax.mapping import Tiles
 from uwbslam_jax.measurements import Odometry, StampedFrame
 from uwbslam_jax.reasons import Lack
@@ -60,7 +60,7 @@ class Session:
     """
 
     def __init__(self, settings: Settings):
-        self.settings = settings = chosen(settings)
+        self.settings = settings
         # until the beacons are placed there is nothing for the paper's steps to stand on
         self.config = dataclasses.replace(make_config(settings), preset="robust")
         self.params = make_params(settings)
