@@ -84,7 +84,7 @@ def test_the_design_example_loads(tmp_path: Path) -> None:
         ({"uwb": {"max_beacons": 8.0}}, "uwb.max_beacons = 8.0: must be an integer"),
         ({"odom": {"use": 1}}, "odom.use = 1: must be true or false"),
         ({"robot": {"antenna": [1, 2]}}, "robot.antenna = [1, 2]: must be a list of 3 numbers"),
-        ({"uwb": {"unit": "km"}}, "uwb.unit = 'km': must be 'auto' or 'm' or 'cm' or 'mm'"),
+        ({"uwb": {"unit": "km"}}, "uwb.unit = 'km': must be 'auto' or 'm' or 'cm' or 'mm' or 'ft' or 'in'"),
         ({"uwb": {"message": 1}}, "uwb.message = 1: must be a section with keys below it"),
         ({"uwb": {"message": {"ranges": "d"}}}, "unknown key uwb.message.ranges, did you mean uwb.message.range?"),
         (

@@ -265,9 +265,10 @@ class FilterSettings:
 
     preset: Literal["robust", "paper"] = "robust"
     """robust: everything. paper: the paper as printed with its errata corrected."""
-    engine: Literal["auto", "jax", "native"] = "auto"
+    engine: Literal["jax", "native", "auto"] = "jax"
     """What steps: jax; native, its twin without XLA, several times as fast, preset robust only; auto: native where it
-    is compiled, else jax, and native is compiled beside the run for the next."""
+    is compiled, else jax, and native is compiled beside the run for the next. A run and its re-run are the same to the
+    bit with the same engine."""
     scan_matching: bool = True
     """Paper's case: without it the map is drawn at the UWB pose."""
     correction: bool = True

@@ -42,7 +42,7 @@ def test_auto_is_native_where_it_serves_and_is_compiled(monkeypatch, asked, pres
 def test_settings_that_no_engine_serves_are_refused():
     with pytest.raises(ConfigError, match=r"filter.engine = 'native': serves filter.preset = 'robust' only"):
         settings_file.check(settings(engine="native", preset="paper"))
-    with pytest.raises(ConfigError, match=r"filter.engine = 'fast': must be 'auto' or 'jax' or 'native'"):
+    with pytest.raises(ConfigError, match=r"filter.engine = 'fast': must be 'jax' or 'native' or 'auto'"):
         settings_file.from_dict({"filter": {"engine": "fast"}})
 
 
