@@ -192,11 +192,9 @@ class Graph:
             last = self.keyframes[-1]
             stamps = int(last["stamp"]), frame.stamp
             far = self._is_far(-1, pose, frame.stamp, informed)
-            if not far and _sees(frame) and self.scans[-1] is None:  # no scan has been here
-                adrift = not np.any(last["informed"]) and not np.isfinite(last["wheels"][0])
+            if not far and _sees(frame) and self.scans[-1] is None:  # wheels alone have been here, no scan has
                 scans = (k for k in range(len(self.scans) - 1, -1, -1) if self.scans[k] is not None)
-                # where wheels alone lead here a scan has to be news; where nothing does, it is all that is known
-                far = adrift or all(self._is_far(k, pose, frame.stamp, informed) for k in itertools.islice(scans, 1))
+                far = all(self._is_far(k, pose, frame.stamp, informed) for k in itertools.islice(scans, 1))
             if self._broken:
                 self.ranges.drop()
             elif far:
