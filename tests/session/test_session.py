@@ -101,7 +101,7 @@ def test_a_beacon_that_is_only_doubted_keeps_its_place_in_the_graph():
     assert set(means["place"][means["slot"] == slot].tolist()) == {place[1]}
 
 
-@pytest.mark.parametrize("engine", ["jax", "native"])
+@pytest.mark.parametrize("engine", ["jax", pytest.param("native", marks=pytest.mark.slow)])
 def test_online_and_batch_give_the_same_bits(engine):
     settings = replace(SETTINGS, filter=replace(SETTINGS.filter, engine=engine))
     online, batch = Session(settings), Session(settings)
