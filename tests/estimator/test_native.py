@@ -201,17 +201,17 @@ def compared(
 
 DRIVES = {
     "hall": ("hall", {}, 600),
-    "hall at 40 Hz": ("hall40", {}, 900),
-    "office": ("office", {}, 900),
+    "hall at 40 Hz": ("hall40", {}, 450),
+    "office": ("office", {}, 450),
     "corridor": ("corridor", {}, 600),
     "kidnapped": ("kidnapped", {}, 900),
     "wheels": ("sparse", {}, 300),
-    "three nodes": ("three", {"max_beacons": 2}, 400),
-    "51 nodes": ("hall", {"max_beacons": 50}, 250),
-    "one level": ("hall", {"levels": 1}, 400),
-    "two levels": ("office", {"levels": 2}, 400),
-    "four levels": ("hall", {"levels": 4}, 400),
-    "LiDAR only": ("office", {"lidar_only": True}, 400),
+    "three nodes": ("three", {"max_beacons": 2}, 250),
+    "51 nodes": ("hall", {"max_beacons": 50}, 150),
+    "one level": ("hall", {"levels": 1}, 200),
+    "two levels": ("office", {"levels": 2}, 200),
+    "four levels": ("hall", {"levels": 4}, 200),
+    "LiDAR only": ("office", {"lidar_only": True}, 200),
 }
 """Scenario, what is set otherwise, and so many frames of it."""
 
@@ -240,14 +240,14 @@ def test_both_engines_make_the_same_of_a_drive_with_the_lidar_upside_down(monkey
 
     robot = dataclasses.replace(made.settings.robot, lidar_flip=True)
     settings = dataclasses.replace(made.settings, robot=robot)
-    compared(monkeypatch, settings, map(turned, made), 500).found.check()
+    compared(monkeypatch, settings, map(turned, made), 250).found.check()
 
 
 @pytest.mark.slow
 def test_both_engines_make_the_same_of_a_recorded_building(monkeypatch, shared_data):
     path = shared_data / "intel" / "intel.mcap"
-    both = compared(monkeypatch, Settings(), us.read(path), 2500)
-    assert both.found.searched > 10
+    both = compared(monkeypatch, Settings(), us.read(path), 1000)
+    assert both.found.searched >= 1
     both.found.check()
 
 
