@@ -95,11 +95,10 @@ class BackEnd:
         revision = self._reviser.look(partial(is_news, state=view.state, graph=self.graph, known=view.found))
         changes = Changes()
         question = None if revision is None else self._question(view)
-        if revision is not None and question is not None:
-            revision = up_to_date(revision, question, view.state)
-        if revision is not None:
+        latest = None if revision is None or question is None else up_to_date(revision, question, view.state)
+        if latest is not None:
             self.taken_over += 1
-            changes = self._take_over(view, revision)
+            changes = self._take_over(view, latest)
             changes = changes._replace(events=[*changes.events, SlotEvent(0, EventKind.CORRECTED)])
         if self.enabled and self._reviser.wants(len(self.graph.keyframes)):
             self._begin(view._replace(state=changes.state or view.state, found=changes.found or view.found))

@@ -39,8 +39,6 @@ _FEWEST_MEANS = 6
 """A resting place that was ranged less takes no part: fewer averages leave more than one place for it."""
 _RADIO = 0.8
 """Where so many of the means to each place are loud, it is the radio that is, and no wall in between [share]."""
-_FASTEST = 5.0
-"""No robot with a LiDAR to map by drives faster indoors [m/s]."""
 _MOVES, _ENOUGH = 25, 0.05
 """Moves of a stage at most [moves]: a bound for starts far off; one that gains less log-likelihood than this is the
 last."""
@@ -110,8 +108,8 @@ def extended(
     if problem is None:
         return None
     problem = replace(problem, freedom=before.freedom)
-    x = problem.risen(problem.joined(*problem.split(problem.start(poses, places))[:2], problem.known(before.off)))
-    return problem.settled(x).explained().solution()
+    start = problem.start(poses, places, problem.known(before.off))
+    return problem.settled(problem.risen(start)).explained().solution()
 
 
 def _by_the_radio(loud: np.ndarray, to: np.ndarray) -> bool:
@@ -154,22 +152,21 @@ class _Solved:
         of the same look hold them there, and no small move leads away. Each is tried between its neighbours."""
         poses, places, off = self.problem.split(self.x)
         astray = self.problem.contradicted(self.x)
-        if not astray.any() or np.sum(~astray) < 2:
+        if not astray.any() or astray.all():
             return self
         good, t = np.flatnonzero(~astray), self.problem.time
         way = np.column_stack([poses[good, :2], np.unwrap(poses[good, 2])])
         there = np.column_stack([np.interp(t, t[good], column) for column in way.T])
-        # scans that come faster than a robot drives were not taken at their stamps, and ranges tell nothing
-        speed = np.hypot(*np.diff(way[:, :2], axis=0).T) / np.maximum(np.diff(t[good]), 1e-3)
-        before = np.clip(np.searchsorted(good, np.flatnonzero(astray)) - 1, 0, len(good) - 2)
-        astray[astray] = speed[before] < _FASTEST
 
         def moved(which: np.ndarray) -> tuple[Problem, np.ndarray]:
             problem = self.problem.evened(which)
             return problem, problem.joined(np.where(which[:, None], there, poses), places, off)
 
         problem, x = moved(astray)
-        problem, x = moved(astray & (self.problem.range_costs(self.x) - problem.range_costs(x) > DECIDED))
+        astray &= self.problem.range_costs(self.x) - problem.range_costs(x) > DECIDED
+        if not astray.any():
+            return self
+        problem, x = moved(astray)
         again = problem.settled(x)
         return again if again.cost < self.cost - DECIDED else self
 
@@ -244,9 +241,9 @@ class Problem(PoseGraph):
         at, after = (np.where(which, self.antenna, lever) for lever in (self.ranges.lever_at, self.ranges.lever_after))
         return replace(self, ranges=self.ranges._replace(lever_at=at, lever_after=after))
 
-    def start(self, poses: np.ndarray, places: dict[Node, np.ndarray]) -> np.ndarray:
-        """Unknowns to start from: poses (N, 3), places of the nodes, nothing off."""
-        return self.joined(poses, np.array([places[node] for node in self.nodes]))
+    def start(self, poses: np.ndarray, places: dict[Node, np.ndarray], off: Off | None = None) -> np.ndarray:
+        """Unknowns to start from: poses (N, 3), places of the nodes, and what is off, nothing where not given."""
+        return self.joined(poses, np.array([places[node] for node in self.nodes]), off)
 
     def minimise(self, poses: np.ndarray, places: np.ndarray, off: Off | None = None) -> _Solved:
         """Levenberg-Marquardt from poses (N, 3), places (B, 2) and what is off."""

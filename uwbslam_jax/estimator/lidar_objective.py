@@ -14,6 +14,9 @@ from jaxtyping import Array, Bool, Float
 from uwbslam_jax.mapping import grid as occupancy
 from uwbslam_jax.numerics import transform_points
 
+_JITTER = (1e-6, 1e-12)
+"""Share of the diagonal that is added to a Gram matrix before its root is taken, and what the diagonal is at least."""
+
 
 def lidar_gram(
     pose: Float[Array, "3"],
@@ -86,8 +89,8 @@ def _lidar_residual_jvp(
 def _root(G: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
     """Upper triangular R with R^T R = G, safe where there is no beam or no gradient."""
     # scaled to unit diagonal so that the jitter is relative in every column
-    scale = jnp.sqrt(jnp.maximum(jnp.diagonal(G), 1e-12))
-    unit = G / (scale[:, None] * scale[None, :]) + 1e-6 * jnp.eye(4, dtype=G.dtype)
+    scale = jnp.sqrt(jnp.maximum(jnp.diagonal(G), _JITTER[1]))
+    unit = G / (scale[:, None] * scale[None, :]) + _JITTER[0] * jnp.eye(4, dtype=G.dtype)
     return jnp.linalg.cholesky(unit).T * scale[None, :]
 
 

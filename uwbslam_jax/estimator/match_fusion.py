@@ -42,6 +42,8 @@ _JUMP = (0.5, 1.0)
 """Largest standard deviation that a jump is given [m, rad]."""
 _CONTRADICTION = 6.0
 """How much worse the ranges may fit a jump than what was expected (difference of robust squares)."""
+_MISFIT_SOFT = 3.0
+"""Of those a range counts at most the square of so many doubled standard deviations."""
 _OTHER_EPOCH = 3.0
 """Ground drawn within so much way of each other errs alike [m]."""
 _PATCH_M = 8.0
@@ -218,7 +220,7 @@ def contradicted(
 
     def misfit(vector: Float[Array, "n"]) -> Float[Array, ""]:
         z = (ranges.range - ranging.predicted_ranges(vector, ranges, params)) / (2 * params.sigma_n)
-        return jnp.sum(jnp.where(robots, z**2 / (1 + z**2 / 9.0), 0.0))
+        return jnp.sum(jnp.where(robots, z**2 / (1 + z**2 / _MISFIT_SOFT**2), 0.0))
 
     driven = innovation[:2] / jnp.maximum(frame.dt, _SHORTEST_S)
     return misfit(belief.mean.at[pose].add(innovation).at[velocity].add(driven)) > misfit(belief.mean) + _CONTRADICTION

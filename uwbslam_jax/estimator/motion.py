@@ -20,6 +20,9 @@ few milliseconds tells that the stamps are late, not that the robot is fast."""
 _FASTEST = (1.5, 2.0, 2.0)
 """However long the robot was not seen, its velocity, yaw rate and heading are not less certain than this
 [m/s, rad/s, rad]."""
+_SHORTEST_S, _LEAST_NOISE = 1e-3, (1e-10, 1e-12)
+"""A shorter time between frames is taken for so long [s]; what the velocity of a beacon at rest and the error of a map
+gain in a frame, so that no variance is 0 [m^2/s^2; m^2, rad^2]."""
 _WIDEST_MAP = (5.0, 1.0)
 """Nor does a map err by more [m, rad]: it is drawn where the robot was believed to be. Without a bound a robot that is
 lost among ground of many epochs has a variance beside which float32 loses all the others."""
@@ -56,7 +59,7 @@ def _put_robot(rows: Float[Array, "n *m"], robot: Float[Array, "9 *m"]) -> Float
 
 def _robot_transition(robot: Float[Array, "9"], dt: Float[Array, ""], odometry: Odometry) -> Float[Array, "9"]:
     place, speed, heading, rate, error = robot[:2], robot[2:4], robot[4], robot[5], robot[6:]
-    coast, safe_dt = _coast(dt), jnp.maximum(dt, 1e-3)
+    coast, safe_dt = _coast(dt), jnp.maximum(dt, _SHORTEST_S)
     turn = rate * coast
     coasted = rotation(turn / 2) @ speed * coast
     driven = rotation(heading) @ odometry.increment[:2]
@@ -87,7 +90,7 @@ def process_noise(
     """
     k = moving.shape[0]
     t = jnp.minimum(dt, _COAST_S)
-    safe_dt = jnp.maximum(dt, 1e-3)
+    safe_dt = jnp.maximum(dt, _SHORTEST_S)
     length = jnp.sqrt(odometry.increment[0] ** 2 + odometry.increment[1] ** 2 + 1e-12)
     odo_xy = (params.odom_sigma_floor[0] + params.odom_sigma_xy * length) ** 2
     odo_yaw = (params.odom_sigma_floor[1] + params.odom_sigma_yaw * jnp.abs(odometry.increment[2])) ** 2
@@ -103,7 +106,7 @@ def process_noise(
         w_yaw * jnp.stack([t**3 / 3, t**2 / 2, t]),
     )
     carried = params.sigma_w_carried**2 * jnp.stack([t**3 / 3, t**2 / 2, t])
-    resting = jnp.stack([params.sigma_w_beacon**2 * dt, 0.0 * dt, 1e-10 + 0.0 * dt])
+    resting = jnp.stack([params.sigma_w_beacon**2 * dt, 0.0 * dt, _LEAST_NOISE[0] + 0.0 * dt])
     nodes = jnp.where(moving[:, None], carried, resting).at[0].set(robot)  # (K, 3): position, coupling, velocity
     p, c, v = (jnp.repeat(nodes[:, m], 2) for m in range(3))
     diagonal = jnp.concatenate([p, v, yaw[:1], yaw[2:], jnp.zeros(3)])
@@ -141,7 +144,9 @@ def predict(
     jump = jnp.where(odometry.valid, 0.0, unrest)
     every = jnp.arange(mean.shape[0])
     pose, error = state_vector.pose_indices(k), every > 4 * k + 1
-    diagonal = diagonal + jnp.where(every < 2, jump[0], jnp.where(every == pose[2], jump[1], 0.0)) + 1e-12 * error
+    diagonal = (
+        diagonal + jnp.where(every < 2, jump[0], jnp.where(every == pose[2], jump[1], 0.0)) + _LEAST_NOISE[1] * error
+    )
     # a place is coupled to its velocity, which stands 2 K further on, the heading to the yaw rate next to it
     partner = jnp.where(every < 2 * k, every + 2 * k, jnp.where(every == 4 * k, 4 * k + 1, -1))
     pair = jnp.where(every[None, :] == partner[:, None], coupling[:, None], 0.0)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from uwbslam_jax.estimator.state import Estimate, init
 from uwbslam_jax.estimator.step import step
 from uwbslam_jax.measurements import Frame, empty_frame
-from uwbslam_jax.settings import Config, Settings, UwbSettings, make_params
+from uwbslam_jax.settings import Config, Params, Settings, UwbSettings, make_params
 
 T = TypeVar("T")
 """A tree of arrays."""
@@ -54,12 +54,16 @@ class Packing(Generic[T]):
         return jax.tree.unflatten(self._structure, leaves)
 
 
+def params_like(config: Config) -> Params:
+    """Shapes and dtypes of the parameters of a configuration."""
+    return jax.eval_shape(lambda: make_params(Settings(uwb=UwbSettings(max_beacons=config.nodes - 1))))
+
+
 @cache
 def packings(config: Config) -> tuple[Packing[Frame], Packing[Estimate]]:
     """How the frames and the estimates of a configuration lie in vectors."""
     frame, state = empty_frame(config.max_beams, config.max_ranges), jax.eval_shape(partial(init, config))
-    params = jax.eval_shape(lambda: make_params(Settings(uwb=UwbSettings(max_beacons=config.nodes - 1))))
-    _, estimate = jax.eval_shape(partial(step, config), params, state, frame)
+    _, estimate = jax.eval_shape(partial(step, config), params_like(config), state, frame)
     return Packing(frame), Packing(as_reported(estimate))
 
 

@@ -6,7 +6,7 @@ Where the differences of stamps and log times go to and fro, it is the log that 
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import count, pairwise
 from statistics import median_low
 from typing import NamedTuple
@@ -27,6 +27,8 @@ _SAME_NS = 1_000_000_000
 
 Times = Sequence[tuple[int, int]]
 """Stamps and log times of a topic's messages in the order of the log [ns]."""
+Logged = tuple[Message, int, str]
+"""A message with its log time [ns] and topic."""
 
 
 class Lateness(NamedTuple):
@@ -34,14 +36,6 @@ class Lateness(NamedTuple):
 
     wait: int
     usual: dict[str, int]
-
-
-class Logged(NamedTuple):
-    """A message with its log time [ns] and topic."""
-
-    message: Message
-    log_time: int
-    topic: str
 
 
 def lateness(seen: Mapping[str, Times]) -> Lateness | None:
@@ -71,7 +65,18 @@ def _to_and_fro(offsets: list[int]) -> int:
     return ordered[-1] - ordered[0] if spread > _LATE_NS and steps > _FRO * spread else 0
 
 
-class StampOrder:
+def in_order(logged: Iterable[Logged], late: Lateness | None) -> Iterator[Logged]:
+    """Messages as the log has them, or where that is no order, in the order of their stamps."""
+    if late is None:
+        yield from logged
+        return
+    order = _StampOrder(late)
+    for message, log_time, topic in logged:
+        yield from order.take(message, log_time, topic)
+    yield from order.flush()
+
+
+class _StampOrder:
     """Puts messages into the order of their stamps, with log times that go with these."""
 
     def __init__(self, late: Lateness):
@@ -85,7 +90,7 @@ class StampOrder:
         usual = self._late.usual.get(topic, self._common)
         apart = usual - self._common
         log = message.stamp - self._common - (apart if abs(apart) > _SAME_NS else 0) if message.stamp > 0 else log_time
-        heapq.heappush(self._held, (log, next(self._number), Logged(message, log, topic)))
+        heapq.heappush(self._held, (log, next(self._number), (message, log, topic)))
         while self._held and self._held[0][0] < log_time - self._late.wait:
             yield heapq.heappop(self._held)[2]
 

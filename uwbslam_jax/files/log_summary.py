@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from uwbslam_jax.errors import LogError
@@ -11,7 +12,7 @@ from uwbslam_jax.files.bag import Bag, Source
 from uwbslam_jax.files.first_look import look_first
 from uwbslam_jax.files.first_ranges import look_ahead
 from uwbslam_jax.files.log_facts import LogFacts
-from uwbslam_jax.files.log_order import StampOrder, told as told_late
+from uwbslam_jax.files.log_order import Logged, in_order, told as told_late
 from uwbslam_jax.files.mcap_log import choose_topics, left_out
 from uwbslam_jax.files.mounting import Mounting, read_mounting
 from uwbslam_jax.files.range_messages import Options, names_told
@@ -138,26 +139,24 @@ def inspect_log(
             problems.append(str(error))
     problems += left_out(recording, roles, options)
     look = look_first(recording, decoders, roles, options)
-    order = StampOrder(look.late) if look.late is not None else None
     problems += [told_late(look.late)] if look.late is not None else []
     ranges = {number: decode for number, decode in decoders.items() if roles[number] == "uwb"}
     look_ahead(recording, ranges, options, scans=bool({"scan", "odom"} & set(roles.values())))
     topic_of = {channel.id: channel.topic for channel in recording.channels.values()}
     clocks = {topic: _Clock() for topic in topic_of.values()}
     heard, on_clock = LogFacts(), MessageClocks(options.dropped, look.rates)
-    for log_time, number, data in recording.records():
-        if number not in topic_of:
-            continue
-        clocks[topic_of[number]].tick(log_time)
-        if number in decoders:
-            for message in decoders[number](data, log_time):
-                if order is None:
-                    heard.take(on_clock.take(message, log_time, topic_of[number]))
-                else:
-                    for logged in order.take(message, log_time, topic_of[number]):
-                        heard.take(on_clock.take(*logged))
-    for logged in order.flush() if order is not None else ():
-        heard.take(on_clock.take(*logged))
+
+    def decoded() -> Iterator[Logged]:
+        for log_time, number, data in recording.records():
+            if number not in topic_of:
+                continue
+            clocks[topic_of[number]].tick(log_time)
+            if number in decoders:
+                for message in decoders[number](data, log_time):
+                    yield message, log_time, topic_of[number]
+
+    for message, log_time, topic in in_order(decoded(), look.late):
+        heard.take(on_clock.take(message, log_time, topic))
     heard.take(on_clock.flush())
     problems += on_clock.warnings
     return LogSummary(

@@ -21,7 +21,7 @@ from uwbslam_jax.evaluation import Truth
 from uwbslam_jax.files.bag import Bag, Source
 from uwbslam_jax.files.first_look import look_first
 from uwbslam_jax.files.first_ranges import look_ahead
-from uwbslam_jax.files.log_order import StampOrder, told as told_late
+from uwbslam_jax.files.log_order import Logged, in_order, told as told_late
 from uwbslam_jax.files.mcap_container import Channel, RecordWriter
 from uwbslam_jax.files.mounting import Mounting, read_mounting
 from uwbslam_jax.files.pose_messages import odometry_parts
@@ -152,17 +152,15 @@ class Recording:
     def _timed(self, clocks: MessageClocks, decoders: dict[int, Decoder]) -> Iterator[Message]:
         """Messages of some channels, on one clock."""
         channels = {n: (decode, self._recording.channels[n].topic) for n, decode in decoders.items()}
-        order = StampOrder(self._look.late) if self._look.late is not None else None
-        for log_time, number, data in self._recording.records(set(decoders)):
-            decode, topic = channels[number]
-            for message in decode(data, log_time):
-                if order is None:
-                    yield from clocks.take(message, log_time, topic)
-                else:
-                    for logged in order.take(message, log_time, topic):
-                        yield from clocks.take(*logged)
-        for logged in order.flush() if order is not None else ():
-            yield from clocks.take(*logged)
+
+        def decoded() -> Iterator[Logged]:
+            for log_time, number, data in self._recording.records(set(decoders)):
+                decode, topic = channels[number]
+                for message in decode(data, log_time):
+                    yield message, log_time, topic
+
+        for message, log_time, topic in in_order(decoded(), self._look.late):
+            yield from clocks.take(message, log_time, topic)
         yield from clocks.flush()
 
 

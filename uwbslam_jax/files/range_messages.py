@@ -254,10 +254,7 @@ def fast_range(options: Options) -> Callable[[bytes, int], list[Message]]:
             options.dropped[RangeLost.MALFORMED] += 1
             return []
         metres = measured * options.scale * unit
-        found = RangeMessage(sec * 1_000_000_000 + nanosec, source, target, metres, *powers)
-        if 0.0 < metres <= options.max_range and metres < math.inf and source != target:
-            return [found]
-        return checked(found, options)
+        return checked(RangeMessage(sec * 1_000_000_000 + nanosec, source, target, metres, *powers), options)
 
     return decode
 

@@ -47,13 +47,9 @@ class Freedom(NamedTuple):
     @staticmethod
     def of(groups: tuple[str, ...]) -> Freedom:
         """Some of "bias", "height", "scale" left open; with the scale of ranges what it is measured by."""
-        return Freedom(
-            bias=_OPEN.bias if "bias" in groups else CALIBRATED_M,
-            height=_OPEN.height if "height" in groups else 0.0,
-            scale=_OPEN.scale if "scale" in groups else 0.0,
-            lidar=_OPEN.lidar if "scale" in groups else 0.0,
-            wheels=_OPEN.wheels if "scale" in groups else 0.0,
-            map=_OPEN.map if "scale" in groups else 0.0,
+        scales = Freedom() if "scale" not in groups else _OPEN
+        return scales._replace(
+            bias=_OPEN.bias if "bias" in groups else CALIBRATED_M, height=_OPEN.height if "height" in groups else 0.0
         )
 
 

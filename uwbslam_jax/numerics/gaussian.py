@@ -13,6 +13,9 @@ import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
+_LEAST_VARIANCE, _ROUNDINGS = 1e-16, 8
+"""A smaller variance is none; a root is that of a matrix with so many roundings for each row added to its diagonal."""
+
 
 class Gaussian(NamedTuple):
     """Mean (n,) and covariance (n, n); units are those of the state."""
@@ -27,8 +30,8 @@ def symmetric_root(cov: Float[Array, "n n"]) -> Float[Array, "n n"]:
     Scaled by the standard deviations first: rounding then is relative to each state's own size, and a direction
     that is known exactly (variance 0) neither fails nor spoils the others.
     """
-    std = jnp.sqrt(jnp.maximum(jnp.diagonal(cov), 1e-16))
-    eps = 8 * jnp.finfo(cov.dtype).eps * cov.shape[0]
+    std = jnp.sqrt(jnp.maximum(jnp.diagonal(cov), _LEAST_VARIANCE))
+    eps = _ROUNDINGS * jnp.finfo(cov.dtype).eps * cov.shape[0]
     correlation = cov / (std[:, None] * std[None, :])
     return std[:, None] * jnp.linalg.cholesky(correlation + eps * jnp.eye(cov.shape[0], dtype=cov.dtype))
 

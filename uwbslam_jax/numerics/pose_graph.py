@@ -19,14 +19,11 @@ from uwbslam_jax.numerics.sparse_least_squares import Sink, blocks, cost_of, eli
 
 _HELD = 1e-4
 """Standard deviation of the first pose, which is held [m, m, rad]."""
-
-
 WAYS = ("lidar", "wheels", "map")
 """What measures the way from pose to pose, as Freedom names its scale: two scans laid over each other, wheels, scans
 matched with a map, which bends."""
 LIDAR, WHEELS, MAP = range(len(WAYS))
 """Their numbers."""
-
 _FAR, _FEWEST_FAR, _MANY = 3.0, 3, 0.25
 """A pose may be contradicted where so many of the ranges around it, and this share, are off by more standard deviations
 than this."""
@@ -342,7 +339,7 @@ class PoseGraph:
     def range_costs(self, x: np.ndarray) -> np.ndarray:
         """(count,) of each pose the negative log-likelihood of the ranges before and after it."""
         cost = 0.5 * soften(self._range_errors(x, slice(None))[0])[0] ** 2
-        return sum((np.bincount(end, cost, self.count) for end in (self.ranges.at, self.ranges.after)), np.zeros(1))
+        return np.bincount(self.ranges.at, cost, self.count) + np.bincount(self.ranges.after, cost, self.count)
 
     def _range_errors(self, x: np.ndarray, part: slice) -> tuple[np.ndarray, ...]:
         """Of some ranges the residual over its standard deviation (n,), and what that depends on: ends (2, n, 2),

@@ -13,9 +13,10 @@ from uwbslam_jax.estimator.native import records
 from uwbslam_jax.estimator.native.grid import polar_tables
 from uwbslam_jax.estimator.native.records import Leaves, fields
 from uwbslam_jax.estimator.native.step import Buffers, step
+from uwbslam_jax.estimator.packing import params_like
 from uwbslam_jax.estimator.state import Estimate, State, init
 from uwbslam_jax.measurements import Frame, empty_frame
-from uwbslam_jax.settings import Config, Params, Settings, UwbSettings, make_params
+from uwbslam_jax.settings import Config, Params
 
 
 class NativeStep:
@@ -32,8 +33,7 @@ class NativeStep:
         places = np.cumsum([0, *(rows * cols for rows, cols in shapes)]).tolist()
         b = self._buffers = _buffers(config, places[-1])
         self._maps = [b.cells[i:j].reshape(s) for i, j, s in zip(places, places[1:], shapes, strict=False)]
-        params = jax.eval_shape(lambda: make_params(Settings(uwb=UwbSettings(max_beacons=config.nodes - 1))))
-        self._params = Leaves(params, fields(b.params) | {"bias": b.bias, "height": b.height})
+        self._params = Leaves(params_like(config), fields(b.params) | {"bias": b.bias, "height": b.height})
         parts = {f"scatter_{name}": part for name, part in zip(("log", "last", "heard"), b.scatter, strict=True)}
         parts |= {"belief_mean": b.mean, "belief_cov": b.cov, "active": b.nodes[0], "moving": b.nodes[1]}
         levels = {f"grid_levels[{k}]": level for k, level in enumerate(self._maps[:-1])}

@@ -2,7 +2,7 @@
 
 numba's own cache does not see a change in another file's function or constant. So it lies in a folder whose name is a
 hash of all sources that the loops and their constants come from, of where they lie, of numba and of the processor.
-Nothing here imports numba, which takes half a second.
+Nothing here imports numba, which takes half a second, or LLVM before it is asked for.
 """
 
 from __future__ import annotations
@@ -15,14 +15,10 @@ from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
-from llvmlite import binding
-
 from uwbslam_jax import process
 
 _PATIENCE_S = 900.0
 """A process that compiles and has not ended for so long has been killed [s]."""
-
-
 _OTHERS = {"engine.py", "kept.py", "warm_up.py"}
 """Modules of this wing in which nothing is compiled [names]."""
 
@@ -30,6 +26,8 @@ _OTHERS = {"engine.py", "kept.py", "warm_up.py"}
 @cache
 def folder() -> Path:
     """Where numba keeps what it compiles of these sources for this processor."""
+    from llvmlite import binding  # no other run has a use for it
+
     package = Path(__file__).parents[2]
     key = hashlib.sha256()
     for path in sorted(p for wing in ("estimator", "mapping") for p in (package / wing).rglob("*.py")):

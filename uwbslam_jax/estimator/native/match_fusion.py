@@ -214,7 +214,7 @@ def misfit(vector: Float[ndarray, "n"], measured: Measured, usable: Int[ndarray,
         if exchange.i == 0 or exchange.j == 0:
             z = measured.ranges[0, usable[u]] - geometry(vector, exchange, model).predicted
             z /= 2 * model.params.sigma_n
-            total += z**2 / (1 + z**2 / 9.0)
+            total += z**2 / (1 + z**2 / twin._MISFIT_SOFT**2)
     return total
 
 

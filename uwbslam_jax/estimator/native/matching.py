@@ -10,15 +10,15 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from uwbslam_jax.estimator import matching as twin
+from uwbslam_jax.estimator.lidar_objective import _JITTER
 from uwbslam_jax.estimator.native.grid import Ends, Window, corner_log_odds, sigmoid, size_of
 from uwbslam_jax.estimator.native.loops import loops, sums
-from uwbslam_jax.estimator.native.records import Belief
+from uwbslam_jax.estimator.native.records import EPS, Belief
 from uwbslam_jax.estimator.native.small import inverse3, product, solve3, times
 from uwbslam_jax.estimator.native.sweep import Surface, Sweep, thinned
+from uwbslam_jax.numerics import gaussian
 
 f32: Any = np.float32
-EPS = 1.1920928955078125e-07
-"""Of float32, in which the twin computes [1]."""
 
 
 class Match(NamedTuple):
@@ -189,11 +189,11 @@ def information_of(cov: Float[ndarray, "3 3"]) -> Float[ndarray, "3 3"]:
     """Inverse of a covariance, as numerics.symmetric_root makes it one."""
     scaled, std = np.empty((3, 3)), np.empty(3)
     for i in range(3):
-        std[i] = math.sqrt(max(cov[i, i], 1e-16))
+        std[i] = math.sqrt(max(cov[i, i], gaussian._LEAST_VARIANCE))
     for i in range(3):
         for j in range(3):
             scaled[i, j] = cov[i, j] / (std[i] * std[j])
-    inverse = inverse3(scaled, 8 * EPS * 3)
+    inverse = inverse3(scaled, gaussian._ROUNDINGS * EPS * 3)
     for i in range(3):
         for j in range(3):
             inverse[i, j] /= std[i] * std[j]
@@ -220,7 +220,7 @@ def at_level(window: Window, k: int, view: View, prior: Prior, pose: Float[ndarr
             held[i] = prior.mean[i] + T[i, 0] * away[0] + T[i, 1] * away[1] + T[i, 2] * away[2]
         G = gram(window, k, held, view.sweep, view.ends)
         for i in range(4):  # the jitter of the twin's root
-            G[i, i] += 1e-6 * max(G[i, i], 1e-12)
+            G[i, i] += _JITTER[0] * max(G[i, i], _JITTER[1])
         H, pull = product(product(T, G), T), times(prior.information, away)
         for i in range(3):
             slope[i] = -(T[i, 0] * G[0, 3] + T[i, 1] * G[1, 3] + T[i, 2] * G[2, 3]) * prior.per_square - pull[i]

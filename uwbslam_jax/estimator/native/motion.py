@@ -69,7 +69,7 @@ def driving(
     robot: Float[ndarray, "9"], dt: float, increment: Float[ndarray, "3"], F: Float[ndarray, "9 9"]
 ) -> Float[ndarray, "9"]:
     """The robot dt [s] later by its odometry, and its Jacobian but for the map error."""
-    safe_dt = max(dt, 1e-3)
+    safe_dt = max(dt, twin._SHORTEST_S)
     c, s = math.cos(robot[4]), math.sin(robot[4])
     x, y = c * increment[0] - s * increment[1], s * increment[0] + c * increment[1]
     most, most_spun = twin._ACCELERATION[0] * dt, twin._ACCELERATION[1] * dt
@@ -165,7 +165,7 @@ def add_increment(P: Float[ndarray, "n n"], q: int, v: int, variance: float, dt:
 def add_robot_noise(P: Float[ndarray, "n n"], params: Record, frame: Record, unrest: Float[ndarray, "2"]) -> None:
     heading = P.shape[0] - 5
     speed, dt = heading // 2, frame.dt
-    t, safe_dt = min(dt, twin._COAST_S), max(dt, 1e-3)
+    t, safe_dt = min(dt, twin._COAST_S), max(dt, twin._SHORTEST_S)
     if frame.odometry_valid:
         increment, floor = frame.odometry_increment, params.odom_sigma_floor
         length = math.sqrt(increment[0] ** 2 + increment[1] ** 2 + 1e-12)
@@ -181,7 +181,7 @@ def add_robot_noise(P: Float[ndarray, "n n"], params: Record, frame: Record, unr
         add_white(P, heading, heading + 1, params.sigma_w_yaw**2, t)
         P[heading, heading] += unrest[1]
     for q in range(heading + 2, heading + 5):
-        P[q, q] += 1e-12
+        P[q, q] += twin._LEAST_NOISE[1]
 
 
 @loops
@@ -192,7 +192,7 @@ def add_beacon_noise(P: Float[ndarray, "n n"], params: Record, dt: float, moving
             add_white(P, q, speed + q, params.sigma_w_carried**2, min(dt, twin._COAST_S))
         else:
             P[q, q] += params.sigma_w_beacon**2 * dt
-            P[speed + q, speed + q] += 1e-10
+            P[speed + q, speed + q] += twin._LEAST_NOISE[0]
 
 
 @loops

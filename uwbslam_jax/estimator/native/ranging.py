@@ -11,7 +11,8 @@ from numpy import ndarray
 
 from uwbslam_jax.estimator import ranging as twin
 from uwbslam_jax.estimator.native.loops import loops
-from uwbslam_jax.estimator.native.records import Belief, Measured, Memory, Model, Told
+from uwbslam_jax.estimator.native.records import EPS, Belief, Measured, Memory, Model, Told
+from uwbslam_jax.numerics import gaussian
 
 
 class Exchange(NamedTuple):
@@ -135,9 +136,9 @@ def learn_scatter(
 @loops
 def inflate(P: Float[ndarray, "n n"]) -> None:
     """What the twin's square root adds to a covariance, see numerics.symmetric_root."""
-    eps = 8 * float(np.finfo(np.float32).eps) * P.shape[0]
+    eps = gaussian._ROUNDINGS * EPS * P.shape[0]
     for i in range(P.shape[0]):
-        P[i, i] += eps * max(P[i, i], 1e-16)
+        P[i, i] += eps * max(P[i, i], gaussian._LEAST_VARIANCE)
 
 
 @loops

@@ -16,6 +16,8 @@ from jax.tree_util import keystr, tree_flatten_with_path
 from jaxtyping import Float
 from numpy import ndarray
 
+EPS = float(np.finfo(np.float32).eps)
+"""Of float32, in which the twins compute [1]."""
 Record = Any
 """One entry of a structured array."""
 
@@ -96,7 +98,7 @@ class Measured(NamedTuple):
     """Twin: Frame.
 
     Attributes:
-      frame: FRAME. beams: (2, B) range and valid. ends: (2, M) slots i and j of the ranges. ranges: (4, M) range, age,
+      frame: FRAME. beams: (2, B) range and valid. slots: (2, M) i and j of the ranges. ranges: (4, M) range, age,
         power gap and valid.
     """
 
@@ -139,12 +141,6 @@ class Leaves:
         """The tree; a leaf is the buffer itself where that has the leaf's type."""
         leaves = [t.astype(d, copy=False) for t, d in zip(self._targets, self._dtypes, strict=True)]
         return jax.tree.unflatten(self._structure, leaves)
-
-    def copy(self) -> Any:
-        """The tree as it is now."""
-        return jax.tree.unflatten(
-            self._structure, [t.astype(d) for t, d in zip(self._targets, self._dtypes, strict=True)]
-        )
 
 
 def fields(records: np.ndarray) -> dict[str, np.ndarray]:
